@@ -336,3 +336,22 @@ def test_mechanics_keys_distinguish_options(name):
 def test_wrong_options(name, options, message):
     with pytest.raises(ValueError, match=message):
         make_robot(name, **options)
+
+
+def test_taut_cables_hold_a_gripper_that_would_buckle_under_their_tensions():
+    robot = make_robot("two_finger_gripper")
+    design = {"length": 0.0398, "height": 0.0214, "joint_height": 0.0052, "poisson_ratio": 0.307, "bar_length": 0.051}
+    statics = Statics(robot.build(design))
+    states = [statics.solve(np.array([0.016, 0.0025, 0.0195, 0.004]) * part) for part in np.linspace(0.0, 1.0, 21)]
+    effector = np.array([state.condensed.delta.e for state in states])
+    assert np.linalg.norm(np.diff(effector, axis=0), axis=1).max() < 8e-3  # no jump
+    assert states[16].stable and not states[-1].stable
+    negative = [(np.linalg.eigvalsh(state.condensed.W.aa) < 0.0).sum() for state in (states[16], states[-1])]
+    assert negative == [0, 1] and statics.linearisation.negative_eigenvalues == 1
+    assert states[-1].slack.tolist() == [False, True, False, True]
+    assert (states[-1].condensed.lambda_.a[[0, 2]] > 0.0).all()
+    # The same as with the taut cables held and the slack ones free.
+    statics.restore(states[-2].x, states[-2].effort)
+    statics.unilateral = np.zeros(4, dtype=bool)
+    held = statics.solve([0.016, 0.0, 0.0195, 0.0], ["displacement", "effort"] * 2)
+    np.testing.assert_allclose(states[-1].x, held.x, atol=1e-8)

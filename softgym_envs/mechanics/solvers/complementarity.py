@@ -126,6 +126,29 @@ def solve_complementarity(W: np.ndarray, gap: np.ndarray, unilateral: np.ndarray
     return y
 
 
+def held_step(W: np.ndarray, gap: np.ndarray, effort: np.ndarray, unilateral: np.ndarray) -> np.ndarray:
+    """Return what `complementary_step` does, from the present set of taut actuators, for any W.
+
+    A body that would buckle under given efforts has an indefinite W, and can be stable as long as its actuators are
+    held. Several sets of taut actuators are consistent then, most of them far away, so one is sought next to the
+    present one: actuators that contradict it change one by one.
+
+    Raises:
+        numpy.linalg.LinAlgError: if no consistent set is found.
+    """
+    offset = gap - W @ effort
+    taut = ~unilateral | (effort > 0.0)
+    tolerance = 1e-12 * float(np.abs(gap).max(initial=0.0))
+    for _ in range(2 * len(gap)):
+        new = np.zeros(len(gap))
+        new[taut] = np.linalg.solve(W[taut][:, taut], -offset[taut])
+        wrong = unilateral & np.where(taut, new < 0.0, W @ new + offset < -tolerance)
+        if not wrong.any():
+            return new - effort
+        taut[np.argmax(wrong)] ^= True
+    raise np.linalg.LinAlgError("no consistent set of taut actuators near the present one")
+
+
 def complementary_step(W: np.ndarray, gap: np.ndarray, effort: np.ndarray, unilateral: np.ndarray) -> np.ndarray:
     """Return steps of driven efforts that close ``gap`` in bilateral rows and make no unilateral row push."""
     if not unilateral.any():

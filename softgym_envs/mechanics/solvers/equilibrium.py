@@ -164,6 +164,23 @@ def checked(name: str, values: Sequence[float] | np.ndarray, count: int) -> np.n
     return array
 
 
+def check_shapes(x: np.ndarray, effort: np.ndarray, nodes: tuple[int, ...], size: int) -> None:
+    """Raise a ValueError unless rows have the shape of a body's ``nodes`` and there are ``size`` efforts."""
+    if x.shape != nodes or effort.shape != (size,):
+        raise ValueError(
+            f"the state has nodes of shape {x.shape} and efforts of shape {effort.shape}, but the body has {nodes} "
+            f"and {(size,)}"
+        )
+
+
+def check_contact(mode: str, contact: Sequence[float] | np.ndarray | None) -> None:
+    """Raise a ValueError for an unknown mode of driven contacts, or if driven positions are missing."""
+    if mode not in ("displacement", "effort"):
+        raise ValueError(f"contact_mode must be 'displacement' or 'effort', got {mode!r}")
+    if mode == "displacement" and contact is None:
+        raise ValueError("contact_mode = 'displacement' needs the positions in 'contact'")
+
+
 def checked_modes(mode: str | Sequence[str], target: np.ndarray, unilateral: np.ndarray) -> list[str]:
     """Return how each actuator is driven, shape (n_a,).
 

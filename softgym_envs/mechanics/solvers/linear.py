@@ -37,6 +37,11 @@ class LinearSolver(ABC):
     def positive_definite(self) -> bool:
         """Whether the last factorised matrix is positive definite."""
 
+    @property
+    def negative_eigenvalues(self) -> int:
+        """How many eigenvalues of the last factorised matrix are negative; -1 if that is not known."""
+        return 0 if self.positive_definite else -1
+
     @abstractmethod
     def solve(self, rhs: np.ndarray) -> np.ndarray:
         """Solve for the columns of ``rhs``, shape (n, k), with the last factorisation."""
@@ -164,7 +169,12 @@ class SuperLUSolver(LinearSolver):
     @property
     def positive_definite(self) -> bool:
         # Without row exchanges the pivots have the signs of the eigenvalues (Sylvester).
-        return bool((self._lu.perm_r == self._lu.perm_c).all() and (self._lu.U.diagonal() > 0.0).all())
+        return self.negative_eigenvalues == 0
+
+    @property
+    def negative_eigenvalues(self) -> int:
+        exchanged = (self._lu.perm_r != self._lu.perm_c).any()
+        return -1 if exchanged else int((self._lu.U.diagonal() <= 0.0).sum())
 
     def solve(self, rhs: np.ndarray) -> np.ndarray:
         return self._lu.solve(np.ascontiguousarray(rhs))

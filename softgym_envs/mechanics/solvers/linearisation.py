@@ -88,6 +88,21 @@ class Linearisation:
         """Whether the factorised tangent is exact and positive definite."""
         return self.exact and self._tangent.solver.positive_definite
 
+    def buckling(self, rows: np.ndarray) -> int:
+        """Return how many negative eigenvalues ``W`` has in rows that carry efforts; 0 where contact may hold the body.
+
+        The body would buckle if these efforts were given. It is stable with the rows held in place if its tangent has
+        as many.
+        """
+        if self.contact is not None or self.positive_definite:
+            return 0
+        return int((np.linalg.eigvalsh(self.W[rows[:, None], rows]) < 0.0).sum())
+
+    @property
+    def negative_eigenvalues(self) -> int:
+        """How many eigenvalues of the factorised tangent are negative; -1 if that is not known."""
+        return self._tangent.solver.negative_eigenvalues
+
     def assemble(self, x: np.ndarray, effort: np.ndarray, *, tangent: bool = True) -> Assembled | None:
         """Return the equations at rows ``x`` (n, 3) and efforts (size,), or None if an element is inverted.
 

@@ -35,3 +35,15 @@ class Bend:
         aside = float(np.linalg.norm(change - factor * self.change))
         alike = 0.1 <= factor <= 2.0 and aside <= 1e-6 * float(np.linalg.norm(change))
         return factor**2 * self.corrections if alike else None
+
+
+def bend_of(change: np.ndarray, corrections: np.ndarray, size: float, straight: float) -> Bend | None:
+    """Return the bend of an increment, or None if an event has made it.
+
+    Args:
+        change: of the commands, shape (size,).
+        corrections: sum of all steps but the first, shape (N,).
+        size: largest displacement of the corrections [m].
+        straight: largest displacement of the first step [m], zero if it was cut.
+    """
+    return Bend(change, corrections) if size <= LARGEST_BEND * straight else None

@@ -26,18 +26,20 @@ from softgym_envs.mechanics.contact.contact import ContactMemory
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.beam_motion import BeamMotion
 from softgym_envs.mechanics.solvers.cable_friction import CableMemory
-from softgym_envs.mechanics.solvers.complementarity import complementary_step
+from softgym_envs.mechanics.solvers.complementarity import complementary_step, held_step
 from softgym_envs.mechanics.solvers.contact_rows import ContactRows
 from softgym_envs.mechanics.solvers.equilibrium import (
     CAUTIOUS,
     Equilibrium,
     NewtonFailure,
     RowLayout,
+    check_contact,
+    check_shapes,
     checked,
     checked_modes,
 )
 from softgym_envs.mechanics.solvers.linearisation import Linearisation
-from softgym_envs.mechanics.solvers.prediction import LARGEST_BEND, Bend
+from softgym_envs.mechanics.solvers.prediction import Bend, bend_of
 
 SHORT_STEP, MOST_SHORT_STEPS = 0.05, 6
 """In contact, an increment is divided after this number of steps in a row of less than this part of Newton's."""
@@ -114,11 +116,7 @@ class Statics:
         Raises:
             ValueError: for another number of nodes or efforts, as those of another body.
         """
-        if x.shape != self.model.nodes.shape or effort.shape != (self._assembly.size,):
-            raise ValueError(
-                f"the state has nodes of shape {x.shape} and efforts of shape {effort.shape}, but the body has "
-                f"{self.model.nodes.shape} and {(self._assembly.size,)}"
-            )
+        check_shapes(x, effort, self.model.nodes.shape, self._assembly.size)
         self.x = x.copy()
         self.effort = effort.copy()
         self._current_loads = self.model.loads
@@ -131,8 +129,7 @@ class Statics:
 
     @snapshot.setter
     def snapshot(self, kept: tuple) -> None:
-        x, effort, memory = kept
-        self.restore(x, effort, memory=memory)
+        self.restore(*kept[:2], memory=kept[2])
 
     @property
     def memory(self) -> ContactMemory | CableMemory | None:
@@ -174,8 +171,9 @@ class Statics:
             W = linear.W[driven[:, None], driven]
             unilateral = np.zeros(len(effort), dtype=bool)
             unilateral[: self._actuators] = self.unilateral
+            step = held_step if self._buckling(driven, effort) else complementary_step
             try:
-                step_effort[driven] = complementary_step(W, gap, effort[driven], unilateral[driven])
+                step_effort[driven] = step(W, gap, effort[driven], unilateral[driven])
             except np.linalg.LinAlgError:  # W is indefinite (unstable) or singular (two actuators act alike)
                 raise NewtonFailure from None
         step_q = linear.response(step_effort, 1.0) if Ar is None else linear.response(step_effort) - Ar
@@ -184,6 +182,12 @@ class Statics:
             open_by = delta[self._bonds] - target[self._bonds]
             step_effort[self._bonds] += self._assembly.bond_stiffness * open_by
         return step_q, step_effort
+
+    def _buckling(self, driven: np.ndarray, effort: np.ndarray) -> int:
+        """Return how many ways the body would buckle if the efforts (size,) of its driven rows were given."""
+        slack = self.unilateral & (effort[: self._actuators] <= 0.0)
+        held = np.setdiff1d(driven, np.flatnonzero(slack))
+        return self.linearisation.buckling(held) if self.unilateral.any() else 0
 
     def _norm(self, step: np.ndarray) -> float:
         """Largest displacement [m] of a step of the equations."""
@@ -240,6 +244,8 @@ class Statics:
                 raise NewtonFailure
             step_q, step_effort = self._correction(None, linear.delta, effort, target, driven)
             if length == 1.0 and self._norm(step_q) <= self.tolerance:
+                if self._buckling(driven, effort) not in (0, linear.negative_eigenvalues):
+                    raise NewtonFailure  # unstable, even with the driven rows held in place
                 return iteration
             length = min(1.0, 2.0 * length)
         raise NewtonFailure
@@ -275,7 +281,7 @@ class Statics:
             if full and norm <= self.tolerance:
                 if not linear.exact and not self._linearise(exact=True):
                     raise NewtonFailure
-                self._note_bend(change, corrections, straight)
+                self._bend = bend_of(change, corrections, self._norm(corrections), straight)
                 return iteration
             if norm > self._longest_step:
                 step_q = step_q * (self._longest_step / norm)
@@ -314,16 +320,11 @@ class Statics:
             self.x, self.effort = x, effort
             if iteration and remaining <= self.tolerance and linear.exact and not self.exact_compliance:
                 linear.follow(assembled)
-                self._note_bend(change, corrections, straight)
+                self._bend = bend_of(change, corrections, self._norm(corrections), straight)
                 return iteration + 1
             if not linear.factorise(assembled, x):
                 raise NewtonFailure
         raise NewtonFailure
-
-    def _note_bend(self, change: np.ndarray, corrections: np.ndarray, straight: float) -> None:
-        """Keep the corrections (N,) of an increment whose first step was ``straight`` [m], or zero if it was cut."""
-        if self._norm(corrections) <= LARGEST_BEND * straight:
-            self._bend = Bend(change, corrections)
 
     def _polish(
         self,
@@ -455,10 +456,7 @@ class Statics:
         count = self._actuators
         target = checked("target", target, count)
         modes = checked_modes(mode, target, self.unilateral)
-        if contact_mode not in ("displacement", "effort"):
-            raise ValueError(f"contact_mode must be 'displacement' or 'effort', got {contact_mode!r}")
-        if contact_mode == "displacement" and contact is None:
-            raise ValueError("contact_mode = 'displacement' needs the positions in 'contact'")
+        check_contact(contact_mode, contact)
         held = [np.array([i for i, m in enumerate(modes) if m == "displacement"], dtype=int)]
         if contact_mode == "displacement":
             held.append(self._contacts)
