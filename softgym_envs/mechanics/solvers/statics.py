@@ -185,8 +185,7 @@ class Statics:
 
     def _buckling(self, driven: np.ndarray, effort: np.ndarray) -> int:
         """Return how many ways the body would buckle if the efforts (size,) of its driven rows were given."""
-        slack = self.unilateral & (effort[: self._actuators] <= 0.0)
-        held = np.setdiff1d(driven, np.flatnonzero(slack))
+        held = np.setdiff1d(driven, np.flatnonzero(self.unilateral & (effort[: self._actuators] <= 0.0)))
         return self.linearisation.buckling(held) if self.unilateral.any() else 0
 
     def _norm(self, step: np.ndarray) -> float:
