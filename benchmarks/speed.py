@@ -86,13 +86,13 @@ class _Shares:
         self._inside = False
 
     def _timed(self, function: Callable[..., Any], part: str) -> Callable[..., Any]:
-        def call(*arguments: Any) -> Any:
+        def call(*arguments: Any, **options: Any) -> Any:
             if self._inside or not self.counting:
-                return function(*arguments)
+                return function(*arguments, **options)
             self._inside = True
             start = time.perf_counter()
             try:
-                return function(*arguments)
+                return function(*arguments, **options)
             finally:
                 self.seconds[part] += time.perf_counter() - start
                 self._inside = False
