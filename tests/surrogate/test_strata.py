@@ -133,6 +133,18 @@ def test_commands_and_bodies_without_equilibrium_are_marked(monkeypatch):
     assert np.isnan(states.effector[1]).all() and np.isfinite(states.effector[[0, 2]]).all()
 
 
+def test_states_that_no_convex_energy_can_have_do_not_count():
+    """Taut cables hold this gripper where it would buckle under their tensions."""
+    robot = make_robot("two_finger_gripper")
+    design = {"length": 0.0398, "height": 0.0214, "joint_height": 0.0052, "poisson_ratio": 0.307, "bar_length": 0.051}
+    pulls = np.array([0.016, 0.0025, 0.0195, 0.004]) * np.linspace(0.2, 1.0, 5)[:, None]
+    commands = Commands(np.array(["inside"]), robot.design_space.complete(design).array[None], pulls[None])
+    states = solve_commands(robot, commands)
+    assert states.found.tolist() == [True, True, True, True, False]
+    assert np.isfinite(states.growth[:4]).all()
+    assert not Statics(robot.build(design)).solve(pulls[-1]).stable  # it is there
+
+
 def test_mirror_images_of_commands_are_not_solved_again(monkeypatch):
     robot = make_robot("finger", mesh="accurate", mesh_size=0.02, self_contact=False)
     space, count = robot.design_space, []

@@ -74,7 +74,8 @@ class JudgedStates:
             are stable only while their actuators are held, shape (N,).
         apart: distance of the effector from that of the equilibrium found from another start [m], shape (N,): more than
             round-off if the command has several equilibria. NaN without a second start.
-        found: whether there is an equilibrium, shape (N,); other rows hold NaN.
+        found: whether there is an equilibrium, shape (N,); other rows hold NaN. Equilibria with an indefinite ``W`` do
+            not count for robots whose learned energy is convex, because it cannot have them.
     """
 
     stratum: np.ndarray
@@ -279,7 +280,7 @@ def _solve_body(robot: Robot, commands: Commands, number: int, second_start: boo
     own = np.unique(source)
     for row, found in solve_path(robot, statics, rest, wanted[own]):
         k = own[row]
-        if found is None:
+        if found is None or (robot.convex and growth_of(rest, found) == np.inf):
             continue
         if second_start:
             other, found = found, _from_rest(statics, rest, wanted[k], found)
