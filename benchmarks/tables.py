@@ -542,7 +542,7 @@ def fem_speed() -> str:
         if key.endswith("-v0: steps per second"):
             name = key.removesuffix(": steps per second")
             nodes, elements, _ = found[f"{name}: nodes, elements, equations"].split(", ")
-            rows.append([name.removesuffix("-v0"), nodes, elements, f"{value:.0f}"])
+            rows.append([name.removesuffix("-v0"), nodes, elements, f"{value:.{0 if value > 10.0 else 1}f}"])
     return markdown(["environment", "nodes", "elements", "steps per second"], rows, "lrrr")
 
 
