@@ -18,7 +18,7 @@ from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.beam_motion import BeamMotion
 from softgym_envs.mechanics.solvers.dynamics import Dynamics, Motion
 from softgym_envs.mechanics.solvers.equilibrium import SATURATED, Equilibrium
-from softgym_envs.mechanics.solvers.later import condensed_at
+from softgym_envs.mechanics.solvers.exact_compliance import condensed_at
 from softgym_envs.mechanics.solvers.learned_errors import possible_errors
 from softgym_envs.mechanics.solvers.schemes import SCHEMES
 from softgym_envs.mechanics.solvers.statics import Statics
@@ -164,7 +164,7 @@ class FEMBackend(Backend):
         """Return the static solver of a body."""
         statics = Statics(model)
         linear, learned = statics.linearisation, any(block.learned for block in model.blocks)
-        # In contact the last factorisation of a step serves W alone, which is computed when it is read.
+        # In contact, only W needs the last factorisation of a step: it is made when W is read.
         statics.exact_compliance = linear.contact is None or linear.rubs or learned
         return statics
 

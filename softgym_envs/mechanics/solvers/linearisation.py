@@ -94,7 +94,7 @@ class Linearisation:
         The body would buckle if these efforts were given. It is stable with the rows held in place if its tangent has
         as many.
         """
-        if self.contact is not None or self.positive_definite:
+        if self.contact is not None:
             return 0
         return int((np.linalg.eigvalsh(self.W[rows[:, None], rows]) < 0.0).sum())
 

@@ -53,8 +53,8 @@ class Statics:
         tolerance: largest remaining correction of any node at convergence [m].
         max_iterations: limit of Newton iterations per load increment.
         max_halvings: the smallest load increment is ``0.5 ** max_halvings`` of the whole step.
-        exact_compliance: compute ``W`` at each equilibrium. Otherwise, with contact, ``W`` may be that of the last
-            iterate, which saves one factorisation per increment; `later.condensed_at` computes it later.
+        exact_compliance: compute ``W`` at each equilibrium. Otherwise, with contact, it may be that of the last
+            iterate, which saves a factorisation; without friction, `exact_compliance.condensed_at` computes it later.
         compiled: solve bodies of beams in compiled code (`BeamMotion`) where that converges fast; it gives the same
             equilibria to the tolerance.
 
@@ -185,8 +185,10 @@ class Statics:
 
     def _buckling(self, driven: np.ndarray, effort: np.ndarray) -> int:
         """Return how many ways the body would buckle if the efforts (size,) of its driven rows were given."""
-        held = np.setdiff1d(driven, np.flatnonzero(self.unilateral & (effort[: self._actuators] <= 0.0)))
-        return self.linearisation.buckling(held) if self.unilateral.any() else 0
+        if self.linearisation.positive_definite or not self.unilateral.any():
+            return 0
+        slack = np.flatnonzero(self.unilateral & (effort[: self._actuators] <= 0.0))
+        return self.linearisation.buckling(np.setdiff1d(driven, slack))
 
     def _norm(self, step: np.ndarray) -> float:
         """Largest displacement [m] of a step of the equations."""
@@ -409,16 +411,16 @@ class Statics:
         return None
 
     def _rests(self, goal: np.ndarray, driven: np.ndarray) -> bool:
-        """Whether the last equilibrium is the commanded one, and nothing else has changed; see `_correction`."""
+        """Whether the last equilibrium, at which it is linearised, is the commanded one; see `_correction`."""
         linear = self.linearisation
-        if linear.rubs or not (linear.current and linear.exact):
-            return False
         try:
             step_q, step_effort = self._correction(None, linear.delta, self.effort, goal, driven)
         except NewtonFailure:
             return False
+        if self._norm(step_q) > self.tolerance or np.delete(step_effort, driven).any():
+            return False
         self._displacement(self.x, step_q)  # raises ValueError for a part that nothing holds
-        return self._norm(step_q) <= self.tolerance and not np.delete(step_effort, driven).any()
+        return True
 
     def _values(self, x: np.ndarray) -> np.ndarray:
         """Values of all constraints (size,) at rows ``x`` (n, 3)."""
@@ -479,7 +481,8 @@ class Statics:
             linear.current = False
         loads, start_loads = self.model.loads, self._current_loads
         linear.loads, ramped = start_loads, bool((loads != start_loads).any())
-        if not ramped and self._rests(goal, driven):
+        # Friction starts anew from the last equilibrium, so it has to be solved for once more.
+        if linear.current and linear.exact and not (ramped or linear.rubs) and self._rests(goal, driven):
             return self._state(goal, driven, 0, 0)
         if not linear.current and not self._linearise():
             raise ConvergenceError("the starting state has inverted elements or a singular tangent", fraction=0.0)
@@ -559,12 +562,9 @@ class Statics:
 
     def _state(self, target: np.ndarray, driven: np.ndarray, iterations: int, increments: int) -> Equilibrium:
         linear, effort = self.linearisation, self.effort.copy()
+        slack = self._layout.slack(effort, linear.delta, target, driven, self.unilateral)
         return self._layout.equilibrium(
-            self.x.copy(),
-            effort,
-            linear.delta.copy(),
-            linear.W.copy(),
-            self._layout.slack(effort, linear.delta, target, driven, self.unilateral),
+            *(self.x.copy(), effort, linear.delta.copy(), linear.W.copy(), slack),
             stable=linear.positive_definite,
             iterations=iterations,
             increments=increments,

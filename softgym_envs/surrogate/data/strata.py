@@ -280,16 +280,21 @@ def _solve_body(robot: Robot, commands: Commands, number: int, second_start: boo
     own = np.unique(source)
     for row, found in solve_path(robot, statics, rest, wanted[own]):
         k = own[row]
-        if found is None or (robot.convex and growth_of(rest, found) == np.inf):
+        if found is None:
+            continue
+        other = found
+        if second_start:
+            found = _from_rest(statics, rest, wanted[k], found)
+        growth = growth_of(rest, found)
+        if robot.convex and growth == np.inf:
             continue
         if second_start:
-            other, found = found, _from_rest(statics, rest, wanted[k], found)
             part.apart[k] = np.abs(found.condensed.delta.e - other.condensed.delta.e).max()
         part.displacement[k], part.effort[k] = found.condensed.delta.a, found.condensed.lambda_.a
         part.effector[k], part.found[k] = found.condensed.delta.e, True
         part.slack[k] = statics.unilateral & (part.displacement[k] > wanted[k] + SLACK * span)
         part.touching[k] = found.contacts is not None and np.isfinite(found.contacts.smallest_gap)
-        part.growth[k] = growth_of(rest, found)
+        part.growth[k] = growth
     for name in ("displacement", "effort", "effector", "slack", "touching", "growth", "apart", "found"):
         getattr(part, name)[:] = getattr(part, name)[source]
     for k in np.flatnonzero(image >= 0):
