@@ -329,8 +329,11 @@ def calibrate(
         WeightsError: if the weights are not an ensemble.
     """
     model = load_model(folder, robot)
-    if not model.ensemble:
-        raise WeightsError(f"'{folder}': only an ensemble can be calibrated; these weights are '{model.network}'")
+    if model.members < 2:
+        raise WeightsError(
+            f"'{folder}': only an ensemble of two or more members can be calibrated; "
+            f"these weights have one member of kind '{model.network}'"
+        )
     if model.card.get("calibration", {}).get("limits_growth"):  # the last calibration did, not the training
         model = with_domain(model, growth=np.inf)
     known = judged_states(model, bodies, states, seed, state_folder, kept_only)

@@ -105,6 +105,7 @@ class SurrogateModel(ABC):
         size: order of W, n_a + n_e + n_s.
         span: a quarter of the actuators' ranges, the unit of steps and tolerances of searches, shape (n_a,).
         domain: where the model may be trusted.
+        members: how many members of the ensemble are used; 1 without an ensemble.
 
     Raises:
         ValueError: if the card or ``members`` does not fit.
@@ -112,6 +113,7 @@ class SurrogateModel(ABC):
 
     network: ClassVar[str]
     ensemble: ClassVar[bool] = False
+    members: int = 1
     senses: ClassVar[bool] = False
 
     def __init__(

@@ -12,6 +12,7 @@ from click.testing import CliRunner
 from softgym_envs import make_robot
 from softgym_envs.backends.torch_batch import TorchBatch
 from softgym_envs.cli.surrogates import calibrate_trust
+from softgym_envs.errors import WeightsError
 from softgym_envs.surrogate import calibration as module
 from softgym_envs.surrogate.calibration import (
     FACTOR_OF,
@@ -32,7 +33,7 @@ from softgym_envs.surrogate.data.strata import JudgedStates, draw_commands, stra
 from softgym_envs.surrogate.domain import OUTSIDE, SOFT, SPREAD, Calibration, Domain, doubt_text
 from softgym_envs.surrogate.features import learned_variables
 from softgym_envs.surrogate.pretrained import pretrained_folder, pretrained_model, shipped_robots
-from softgym_envs.surrogate.weight_files import load_model
+from softgym_envs.surrogate.weight_files import load_model, save_model
 from softgym_envs.testing import random_states
 
 CALIBRATION = {
@@ -441,6 +442,13 @@ def test_calibration_of_weights_from_start_to_end(tmp_path, monkeypatch):
     assert again.keys() == rows.keys()
     kept = module.calibration_states(load_model(folder, robot), tmp_path / "states")
     assert {name: asdict(row) for name, row in report(model, kept).items()} == rows
+
+
+def test_weights_without_a_spread_are_refused(tmp_path):
+    trunk = make_robot("trunk")
+    save_model(load_model(pretrained_folder(trunk), trunk, members=1), tmp_path)
+    with pytest.raises(WeightsError, match=r"two or more members.*have one member of kind 'potential'"):
+        calibrate(tmp_path, trunk, bodies=2, states=1, attacks=0)
 
 
 # -- shipped weights --------------------------------------------------------------------------------------------------
