@@ -75,10 +75,10 @@ class HybridBackend(Backend):
             read. By default both stay in memory.
         retrain_after: number of new FEM states after which the ensemble learns; 0 for never.
         steps: steps of Adam for each member in each retraining.
-        tolerance: largest accepted uncertainty of the effector [m]; below the limit of the weights, that limit. Default:
-            the limit of calibrated weights, because errors above the robot's ``goal_tolerance`` were found beyond it;
-            of other weights, at least a tenth of that tolerance, because 2 % of their validation states are above their
-            limit, however small it is.
+        tolerance: largest accepted uncertainty of the effector [m]; below the limit of the weights, that limit holds.
+            Default: the limit of calibrated weights, because errors above the robot's ``goal_tolerance`` were found
+            beyond it; of other weights, at least a tenth of that tolerance, because 2 % of their validation states are
+            above their limit, however small it is.
         seed: seed of the learning.
 
     Attributes:
