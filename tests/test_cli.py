@@ -99,7 +99,8 @@ def test_dataset_fit_and_train(softgym, tmp_path):
     arguments = ["fit", "--config", config, "--folder", fitted, "--data", data, "--quiet", *tiny]
     status, out, err = softgym(*arguments)
     assert status == 0, err
-    assert "effector_mean" in out and (fitted / "model.safetensors").exists()
+    assert json.loads(out)["effector_mean"] > 0.0 and (fitted / "model.safetensors").exists()
+    assert "errors of the effector are in metres, all others are shares (1 is 100%)" in err
     config = ROOT / "configs" / "agents" / "finger_reach.yaml"
     small = [
         "steps=64",

@@ -24,7 +24,6 @@ ROOT = Path(__file__).parent.parent
 
 REWRITTEN = {
     "agents/weights/gripper_pinch_designs_analytic/policy.json provenance",
-    "agents/weights/tetrapod_reach_analytic/policy.json provenance",
     "benchmarks/data/recorded.json sensor_trials",
     "benchmarks/data/recorded.json zigzag_robust",
     "codesign/benchmark/data/references/cable-trunk-reach-v2.json found",

@@ -477,11 +477,14 @@ class ChainHandBackend(Backend):
                 break
             index = np.flatnonzero(held)
             efforts = hand.memory.efforts[index]
+            # A servo stops short of its command, whether it closes or opens.
+            wanted, aimed = command[index], targets[index]
+            closes = np.where(aimed == wanted, efforts > 0.0, aimed < wanted)
             # Slightly below the limit, so that rounding does not count as more.
             missing = np.copysign(self._max_effort[index] * (1.0 - 5e-7), efforts) - efforts
             targets = targets.copy()
-            targets[index] += np.linalg.solve(np.linalg.inv(W[:3, :3])[np.ix_(index, index)], missing)
-            targets = np.minimum(targets, command)
+            aimed = aimed + np.linalg.solve(np.linalg.inv(W[:3, :3])[np.ix_(index, index)], missing)
+            targets[index] = np.where(closes, np.minimum(aimed, wanted), np.maximum(aimed, wanted))
         hand.memory = start
         raise ConvergenceError("the learned hand finds no motion with the largest torque of a servo", fraction=0.0)
 

@@ -75,8 +75,10 @@ class HybridBackend(Backend):
             read. By default both stay in memory.
         retrain_after: number of new FEM states after which the ensemble learns; 0 for never.
         steps: steps of Adam for each member in each retraining.
-        tolerance: largest accepted uncertainty of the effector [m]; default a tenth of the robot's ``goal_tolerance``.
-            Uncertainties up to the limit of the weights are always accepted.
+        tolerance: largest accepted uncertainty of the effector [m]; below the limit of the weights, that limit holds.
+            Default: the limit of calibrated weights, because errors above the robot's ``goal_tolerance`` were found
+            beyond it; of other weights, at least a tenth of that tolerance, because 2 % of their validation states are
+            above their limit, however small it is.
         seed: seed of the learning.
 
     Attributes:
@@ -110,9 +112,7 @@ class HybridBackend(Backend):
         for name, value, least in (("retrain_after", retrain_after, 0), ("steps", steps, 1)):
             if isinstance(value, bool) or not isinstance(value, int) or value < least:
                 raise ValueError(f"{name} = {value!r} must be an integer of at least {least}")
-        if tolerance is None:
-            tolerance = 0.1 * robot.goal_tolerance
-        elif not (np.isfinite(tolerance) and tolerance > 0.0):
+        if tolerance is not None and not (np.isfinite(tolerance) and tolerance > 0.0):
             raise ValueError(f"tolerance = {tolerance} m must be positive and finite")
         self.robot = robot
         self._unilateral = robot.unilateral
@@ -120,6 +120,8 @@ class HybridBackend(Backend):
         self._retrain_after, self._steps, self._seed = retrain_after, steps, seed
         given = check_ensemble(pretrained_model(robot, weights, members))
         domain = given.card["domain"]
+        if tolerance is None:
+            tolerance = 0.0 if domain.get("calibration") else 0.1 * robot.goal_tolerance
         card = {**given.card, "domain": {**domain, "limit": max(tolerance, float(domain["limit"]))}}
         self.original = Model(robot, given.tensors, card)
         self.model = self.original
@@ -169,7 +171,8 @@ class HybridBackend(Backend):
         except ConvergenceError:
             found = None
         self.calls += 1
-        if found is None or not found.trusted:
+        # The learned model does not know the largest efforts.
+        if found is None or not found.trusted or (np.abs(found.effort) > self._max_effort).any():
             found = self._solve(np.asarray(command, dtype=float), mode)
         self.state = found
         return self.state

@@ -19,7 +19,7 @@ from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.inertia import read_inertia
 from softgym_envs.surrogate.model import Context, SurrogateModel
-from softgym_envs.surrogate.pretrained import pretrained_folder, pretrained_model
+from softgym_envs.surrogate.pretrained import pretrained_folder, standalone_model
 
 #: A search ends when its next step is below this [quarter of the actuator range]: 3e-7 m for a cable of 20 mm. Single
 #: precision does not allow much less.
@@ -294,7 +294,7 @@ class SurrogateBackend(Backend):
         steps: time steps of a control step, and damping.
 
     Raises:
-        WeightsError: if there are no weights for the robot, or they are damaged.
+        WeightsError: if there are no weights for the robot, they are damaged, or its actuators have a largest effort.
         ValueError: for a robot whose energy is not convex.
     """
 
@@ -319,7 +319,7 @@ class SurrogateBackend(Backend):
         self.robot = robot
         learned = robot.under_touch()
         self.takes_touch = learned is not robot
-        self.model = pretrained_model(learned, weights, members)
+        self.model = standalone_model(learned, weights, members)
         self._touch: PointForce | None = None
         self.steps = TimeSteps(control_step, time_step, mass_damping, stiffness_damping)
         self._motion = _motion_of(self.model, weights, dynamics, self.steps)
@@ -387,7 +387,7 @@ class SurrogateBatch(BatchBackend):
         model: the learned model.
 
     Raises:
-        WeightsError: if there are no weights for the robot, or they are damaged.
+        WeightsError: if there are no weights for the robot, they are damaged, or its actuators have a largest effort.
     """
 
     def __init__(
@@ -401,7 +401,7 @@ class SurrogateBatch(BatchBackend):
         **steps: float,
     ) -> None:
         self.robot = robot
-        self.model = pretrained_model(robot, weights, members)
+        self.model = standalone_model(robot, weights, members)
         self._motion = _motion_of(self.model, weights, dynamics, TimeSteps(**steps))
         self.moving = dynamics
         self._unilateral = robot.unilateral

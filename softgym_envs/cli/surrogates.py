@@ -46,6 +46,7 @@ def fit(config: Path, folder: Path, data: Path | None, quiet: bool, overrides: t
     with options.resumable():
         errors = run(load_config(config, FitConfig, overrides), folder, data or folder / "data", progress=not quiet)
     click.echo(json.dumps(errors, indent=2))
+    click.echo("errors of the effector are in metres, all others are shares (1 is 100%)", err=True)
 
 
 @click.command("calibrate-trust")

@@ -170,17 +170,20 @@ class InverseQP:
 
     @classmethod
     def for_robot(cls, robot: Robot, **options: Any) -> Self:
-        """Return the controller of a robot, with the ranges and rates of its actuators.
+        """Return the controller of a robot, with the ranges, rates and largest efforts of its actuators.
 
         Args:
             robot: the robot. The goal weights of a robot with one effector are its goal axes.
             **options: arguments of the class, which replace those of the robot.
         """
+        largest = np.array([actuator.max_effort for actuator in robot.actuators])
         arguments = {
             "lower": robot.lower,
             "upper": robot.upper,
             "rates": robot.rates,
             "unilateral": robot.unilateral,
+            "min_effort": -largest,
+            "max_effort": largest,
             "goal_weights": None if len(robot.effectors) > 1 or np.all(robot.goal_axes) else robot.goal_axes,
         }
         return cls(**{**arguments, **options})
@@ -191,7 +194,7 @@ class InverseQP:
 
         Args:
             robot: the robot.
-            largest: largest effort of every actuator [N, Pa, ...].
+            largest: largest effort of every actuator, either way [N, Pa, ...].
             rate: largest change of an effort per call.
             **options: arguments of the class, which replace those of the robot.
 
@@ -205,6 +208,7 @@ class InverseQP:
             "lower": -unbounded,
             "upper": unbounded,
             "rates": unbounded,
+            "min_effort": np.full(len(unbounded), -largest),
             "max_effort": np.full(len(unbounded), largest),
             "effort_rates": np.full(len(unbounded), rate),
             "mode": "effort",

@@ -52,7 +52,8 @@ def settle(
     """Return where the inverse QP of a robot with one effector stays: it steps from equilibrium to equilibrium.
 
     The nearest equilibrium to the goal is returned, so a step that leads away is not taken, and the next one is half as
-    long.
+    long. Neither the solver nor this controller keeps to the largest efforts of the actuators: compare ``effort`` with
+    them.
 
     Args:
         statics: solver of the body.
@@ -84,7 +85,7 @@ def settle(
             else:
                 longest *= 0.5
         found, state = best
-        controller = InverseQP.for_robot(robot, rates=longest * span)
+        controller = InverseQP.for_robot(robot, rates=longest * span, min_effort=None, max_effort=None)
         command = controller.solve(state.condensed, goal, found.command, state.slack)
         change = float((np.abs(command - found.command) / span).max())
         if change <= tolerance:

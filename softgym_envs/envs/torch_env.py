@@ -36,7 +36,7 @@ from softgym_envs.envs.options import (
     take_reset_mask,
 )
 from softgym_envs.envs.registration import ENVIRONMENTS, find_row
-from softgym_envs.surrogate.pretrained import pretrained_model
+from softgym_envs.surrogate.pretrained import standalone_model
 
 if TYPE_CHECKING:
     from softgym_envs.envs.registration import RobotSource, TaskSource
@@ -72,7 +72,8 @@ class TorchVectorEnv(VectorEnv[Tensor, Tensor, Tensor]):
     Raises:
         ValueError: for an unsupported ID, task, network, device or option.
         DesignError: for a malformed design.
-        WeightsError: if no weights ship for the robot, or they have fewer members than ``backend_options`` requests.
+        WeightsError: if no weights ship for the robot, its actuators have a largest effort, or the weights have fewer
+            members than ``backend_options`` requests.
     """
 
     def __init__(
@@ -111,7 +112,7 @@ class TorchVectorEnv(VectorEnv[Tensor, Tensor, Tensor]):
         self.metadata = {"autoreset_mode": self.autoreset_mode, "render_modes": []}
         self.render_mode, self.spec = None, gymnasium.spec(id)
         self._task, self._spaces = with_tensors(self.task, self._put), with_tensors(self.spaces, self._put)
-        self._model = TorchBatch(pretrained_model(self.robot, **setup.backend_options), self.device, dtype)
+        self._model = TorchBatch(standalone_model(self.robot, **setup.backend_options), self.device, dtype)
 
         # Designs are kept in double precision: near 0.5 a Poisson's ratio needs its digits.
         variables = list(self.design_space)

@@ -156,7 +156,8 @@ def evaluate_grasp(
     Friction depends on the path, so objectives depend a little on the number of angles.
 
     Args:
-        robot: the finger.
+        robot: the finger. Its obstacles, and its distance and stiffness of contact, hold here too; its surfaces always
+            touch each other, with the friction given below.
         design: its body; missing variables take their baseline.
         target: the object; default: the plane of the thesis, 30.1 mm from the finger.
         angle: largest angle [rad]; 30 degrees in the thesis, 40 for the hexagon and the sphere.
@@ -180,9 +181,9 @@ def evaluate_grasp(
         model = robot.build(design)
         nodes = len(model.nodes) - 4 * len(model.frames)
         contact = model.set_contact(
-            obstacles=[target.obstacle(robot.width)],
+            obstacles=[target.obstacle(robot.width), *robot.obstacles],
             excluded=np.flatnonzero(model.nodes[:nodes, 1] < HELD + 1e-9),
-            settings=ContactSettings(self_contact=True, self_friction=self_friction),
+            settings=ContactSettings(True, self_friction, robot.contact_distance, robot.contact_stiffness),
         )
         if crossing := contact.intersections(model.nodes):
             raise InfeasibleDesign(f"{crossing} at rest")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -66,6 +67,20 @@ def pretrained_model(robot: Robot, weights: str | Path | None = None, members: i
             f"backend_options={{'weights': folder}}; shipped: {', '.join(shipped) or 'none'}"
         )
     return load_model(folder, robot, members)
+
+
+def standalone_model(robot: Robot, weights: str | Path | None = None, members: int | None = None) -> SurrogateModel:
+    """Return the learned model of a robot that runs on it alone, see `pretrained_model`.
+
+    Raises:
+        WeightsError: also for actuators with a largest effort, which learned models do not know.
+    """
+    if limited := [actuator.name for actuator in robot.actuators if math.isfinite(actuator.max_effort)]:
+        raise WeightsError(
+            f"robot '{robot.name}': a surrogate drives actuators beyond their max_effort ({', '.join(limited)}); use "
+            "backend='fem' or 'hybrid'"
+        )
+    return pretrained_model(robot, weights, members)
 
 
 def shipped_robots() -> dict[str, tuple[str, dict[str, Any]]]:

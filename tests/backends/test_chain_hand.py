@@ -147,6 +147,16 @@ def test_servos_stop_at_their_largest_torque():
     assert (state.displacement[:2] < state.command[:2] - 0.01).all()
 
 
+def test_servos_that_open_stop_at_their_largest_torque_too():
+    weak = make_robot("contact_aided_gripper")
+    weak.actuators = tuple(replace(a, max_effort=0.008) if a.unit == "rad" else a for a in weak.actuators)
+    backend = hand(weak)
+    state = backend.step(np.array([*np.radians([-15.0, -6.0]), 0.0]))
+    assert state.effort[0] == pytest.approx(-0.008, rel=1e-5)
+    assert state.displacement[0] > state.command[0] + 0.01
+    assert state.displacement[1] == state.command[1]
+
+
 def test_wrong_input(robot):
     backend = hand(robot)
     with pytest.raises(ValueError, match="mode = 'effort' is not possible on a learned hand"):

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import shutil
+from dataclasses import replace
+
 import gymnasium
 import numpy as np
 import pytest
@@ -11,7 +15,7 @@ from softgym_envs import make_robot
 from softgym_envs.backends import make_backend
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.backends.hybrid import HybridBackend
-from softgym_envs.backends.surrogate import SurrogateBackend
+from softgym_envs.backends.surrogate import SurrogateBackend, SurrogateBatch
 from softgym_envs.errors import ConvergenceError, DataError, WeightsError
 from softgym_envs.testing import train_small_surrogate
 
@@ -189,6 +193,33 @@ def test_environment(weights, tmp_path):
     env.reset(seed=1)
     assert backend.retrainings == 0 and list(tmp_path.glob("states_*.npz"))
     env.close()
+
+
+@pytest.mark.parametrize("calibrated", [False, True])
+def test_the_limit_of_calibrated_weights_is_not_raised(robot, weights, tmp_path, calibrated):
+    folder = shutil.copytree(weights, tmp_path / "weights")
+    card = json.loads((folder / "model.json").read_text())
+    card["domain"] |= {"limit": 1e-7} | ({"calibration": {"faces": 1.5}} if calibrated else {})
+    (folder / "model.json").write_text(json.dumps(card))
+    expected = 1e-7 if calibrated else 0.1 * robot.goal_tolerance
+    assert HybridBackend(robot, weights=folder).model.domain.limit == expected
+    assert HybridBackend(robot, weights=folder, tolerance=3e-4).model.domain.limit == 3e-4
+
+
+def test_finite_elements_answer_where_an_actuator_is_too_weak(robot, weights):
+    """The learned model does not know largest efforts; alone, it is refused."""
+    full = SurrogateBackend(robot, weights=weights).step(np.array([0.005])).effort[0]
+    weak = make_robot("finger", cables=1)
+    weak.actuators = (replace(robot.actuators[0], max_effort=0.5 * full),)
+    backend, fem = HybridBackend(weak, weights=weights), FEMBackend(weak)
+    assert backend.step(np.array([0.001])).nodes is None
+    state = backend.step(np.array([0.005]))
+    np.testing.assert_allclose(state.effort, 0.5 * full, rtol=1e-6)
+    np.testing.assert_allclose(state.displacement, fem.step(np.array([0.005])).displacement, rtol=1e-4)
+    with pytest.raises(WeightsError, match=r"beyond their max_effort \(\w+\); use backend='fem' or 'hybrid'"):
+        SurrogateBackend(weak, weights=weights)
+    with pytest.raises(WeightsError, match="beyond their max_effort"):
+        SurrogateBatch(weak, weak.design_space.baseline.array[None], weights=weights)
 
 
 def test_errors(robot, weights):

@@ -74,6 +74,20 @@ def test_reaches_reachable_goals(linear, rng):
         assert (np.diff(distances) < 1e-7).all()
 
 
+def test_the_controller_of_a_robot_does_not_command_more_than_its_actuators_give():
+    robot = make_robot("modular_arm", max_effort=0.05)
+    backend, command = FEMBackend(robot), np.zeros(2)
+    state = backend.state
+    goal = state.effector[0] + [0.03, 0.01, -0.005]  # out of reach
+    controller = InverseQP.for_robot(robot)
+    for _ in range(15):
+        command = controller.solve(state.condensed, goal, command)
+        assert np.abs(controller.effort).max() < 0.05 + 1e-9
+        state = backend.step(command)
+    np.testing.assert_allclose(state.effort, 0.05, rtol=1e-6)
+    np.testing.assert_allclose(command, state.displacement, rtol=1e-3)  # commands do not run ahead
+
+
 def test_one_step_is_the_least_squares_answer_where_no_bound_is_active(linear):
     """Against the normal equations, with W_ea, W_aa and the two weights written out."""
     linear.go(np.array([0.010, 0.006, 0.005]))

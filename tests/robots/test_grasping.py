@@ -179,6 +179,19 @@ def test_a_finger_that_closes_too_slowly_gives_up(robot, closed, monkeypatch):
     assert len(found.angle) == 3
 
 
+def test_a_finger_closes_among_its_obstacles_with_its_law_of_contact(robot, closed):
+    options = {"control_points": 7, "mesh_size": 12e-3, "element": "linear"}
+    wall = GraspObject().obstacle(robot.width)
+    among = make_robot("contact_aided_finger", obstacles=[wall], **options)
+    grasp = evaluate_grasp(among, {}, GraspObject(distance=0.2), angles=8)
+    np.testing.assert_allclose(grasp.torque, closed.torque, rtol=1e-6)
+    np.testing.assert_array_equal(grasp.contacts, closed.contacts)
+    np.testing.assert_array_equal(grasp.force, 0.0)  # of the object, which is far away
+    wide = make_robot("contact_aided_finger", contact_distance=1e-3, **options)
+    gaps = evaluate_grasp(wide, {}, angles=8).gap[closed.contacts > 0]
+    assert ((gaps > 5e-4) & (gaps < 1e-3)).all()
+
+
 def test_bugs_surface(robot, monkeypatch):
     monkeypatch.setattr(Statics, "solve", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
