@@ -213,7 +213,7 @@ MISTAKES = {
     ),
     "name without a list": (
         lambda _: gymnasium.make(REACH, sample_design="length"),
-        "sample_design = 'length' must be True, False or a list of design variables, such as ['length']",
+        "sample_design = 'length' must be True, False or a list of names, such as ['length']",
     ),
     "option that only the environment takes": (
         lambda _: gymnasium.make(REACH, bakend="fem"),

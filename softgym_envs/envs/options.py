@@ -197,12 +197,10 @@ def design_names(space: DesignSpace, choice: bool | Sequence[str], option: str) 
         return space.names if choice else ()
     if isinstance(choice, str) or not isinstance(choice, Iterable):
         example = choice if isinstance(choice, str) else space.names[0]
-        raise DesignError(
-            f"{option} = {choice!r} must be True, False or a list of design variables, such as [{example!r}]"
-        )
+        raise DesignError(f"{option} = {choice!r} must be True, False or a list of names, such as [{example!r}]")
     names = tuple(space[name].name for name in choice)
     if len(set(names)) < len(names):
-        raise DesignError(f"{option} = {list(names)} names a design variable twice")
+        raise DesignError(f"{option} = {list(names)} must differ from each other")
     return names
 
 
