@@ -110,8 +110,8 @@ class EnvironmentConfig(Config):
 
     @property
     def has_surrogate(self) -> bool:
-        """Whether surrogate weights ship for the robot."""
-        return (self.row.backend or default_backend(self.make_robot(), {})) == "surrogate"
+        """Whether surrogate weights ship for the robot or are given."""
+        return (self.row.backend or default_backend(self.make_robot(), self.backend_options)) == "surrogate"
 
     @property
     def batched(self) -> bool:

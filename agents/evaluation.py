@@ -12,9 +12,9 @@ import numpy as np
 
 from softgym_envs.agents.baselines import BASELINES, Agent, make_baseline
 from softgym_envs.agents.config import EnvironmentConfig
-from softgym_envs.agents.policy import Policy
+from softgym_envs.agents.policy import POLICY_FILE, Policy, shipped_policies
 from softgym_envs.agents.residual import BatchQP
-from softgym_envs.errors import DataError
+from softgym_envs.errors import ConfigError, DataError, unknown_name
 from softgym_envs.executors import parallel_map
 
 if TYPE_CHECKING:
@@ -209,13 +209,34 @@ def _draw_episodes(
     return designs, np.stack(goals)
 
 
+def check_agent(agent: str | Path) -> None:
+    """Check that an agent is a baseline, a shipped policy or a file.
+
+    Raises:
+        ConfigError: with the nearest name, and the allowed ones.
+    """
+    name = str(agent)
+    names = [*BASELINES, *shipped_policies()]
+    if name in names or name.endswith(".safetensors"):
+        return
+    policy = Path(name) / "policy.safetensors"
+    if policy.exists():
+        raise ConfigError(f"agent '{name}' is the folder of a training; its policy is {policy}")
+    raise ConfigError(unknown_name("agent", name, names, other=POLICY_FILE))
+
+
 def make_agent(agent: str | Path, seed: int = 0) -> Agent:
     """Return ``agent(observation, env.unwrapped) -> action``.
 
     Args:
         agent: one of `BASELINES`, see `make_baseline`; or a policy file, or the name of a shipped policy.
         seed: seed of the random agent.
+
+    Raises:
+        ConfigError: for an unknown name.
+        WeightsError: if the policy cannot be read.
     """
+    check_agent(agent)
     if agent in BASELINES:
         return make_baseline(str(agent), seed)
     return _acting(Policy(agent))
@@ -257,12 +278,19 @@ def evaluate(
         The outcome, whose times include making the environment; the CPU time is that of all processes.
 
     Raises:
-        ValueError: for fewer than one worker, goals of another shape, or another number of bodies than goals.
-        ConfigError: if the policy was trained for another environment, see `Policy.check_environment`.
+        ValueError: for fewer than one worker, goals of another shape, another number of bodies than goals, or an
+            environment that is not an `EnvironmentConfig`.
+        ConfigError: for an unknown agent, or if the policy was trained for another environment, see
+            `Policy.check_environment`.
         WeightsError: if the policy cannot be read.
     """
     if workers < 1:
         raise ValueError(f"workers = {workers} must be 1 or more")
+    if not isinstance(environment, EnvironmentConfig):
+        raise ValueError(
+            f"environment = {environment!r} must be an EnvironmentConfig, such as EnvironmentConfig(id=ID)"
+        )
+    check_agent(agent)
     goals = np.asarray(goals, dtype=float)
     goals = goals[:, None, :] if goals.ndim == 2 else goals
     if goals.ndim != 3 or goals.shape[2] != 3 or not goals.size:

@@ -213,7 +213,7 @@ class Policy:
 def _meaning(environment: EnvironmentConfig, any_task: bool) -> dict[str, tuple[Any, object]]:
     """Return what defines observations and actions: for each key, the value to compare and the text for a message."""
     row, robot = environment.row, environment.make_robot()
-    shown = design_names(robot.design_space, environment.design_in_observation)
+    shown = design_names(robot.design_space, environment.design_in_observation, "design_in_observation")
     variables = [robot.design_space[name] for name in shown]
     task = environment.make_task(robot)
     # Goals of other tasks are read alike if they have the same unit and scales.

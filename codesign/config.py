@@ -131,7 +131,8 @@ class StudyConfig(StudyProblem):
         goals, row, trains = self.goals, self.environment.row, self.plan.trains or self.plan.proposer
         refuse(
             goals.source == "family" and not self.environment.has_surrogate,
-            f"goals.source = 'family' needs a surrogate, and robot '{row.robot}' has none; allowed: task, zone",
+            f"goals.source = 'family' needs a surrogate: give the weights of robot '{row.robot}' as "
+            "environment.backend_options.weights; allowed without: task, zone",
         )
         refuse(
             goals.source != "task"

@@ -119,7 +119,7 @@ def _check_policy(config: StudyConfig) -> None:
         return
     policy = Policy(config.policy)
     policy.check_environment(config.environment)
-    drawn = design_names(config.space, policy.environment.sample_design)
+    drawn = design_names(config.space, policy.environment.sample_design, "sample_design")
     if config.plan.shares_policy and (unknown := sorted(set(config.variables) - set(drawn))):
         raise ConfigError(
             f"policy '{config.policy}' was trained without variation of {', '.join(unknown)}, so it cannot score "

@@ -97,7 +97,7 @@ class Registry(Mapping[str, type]):
         """
         if not isinstance(name_or_class, str | type):
             made = name_or_class
-            self._checked(type(made))
+            self._check_object(made)
             if options:
                 raise ValueError(
                     f"{self.kind} '{_shown(type(made))}' is already an object: it cannot take {', '.join(options)}"
@@ -152,6 +152,14 @@ class Registry(Mapping[str, type]):
         if not (isinstance(cls, type) and issubclass(cls, base)):
             raise ValueError(f"a {self.kind} must be a subclass of {module}.{name}, got {cls!r}")
         return cls
+
+    def _check_object(self, made: object) -> None:
+        module, _, name = self._base.partition(":")
+        if not isinstance(made, getattr(import_module(module), name)):
+            raise ValueError(
+                f"a {self.kind} must be a registered name, 'module:class', a subclass of {module}.{name} "
+                f"or an object of one, got {made!r}"
+            )
 
     def _name_of(self, cls: type, name: str) -> str:
         """Return the name to register a class under, and assign it to a class without a name."""

@@ -132,7 +132,7 @@ def test_a_class_without_a_name_is_refused(registry):
         (f"{__name__}:Disk", {}, "module '.*' has no 'Disk'"),
         ("json:JSONDecoder", {}, "a shape must be a subclass of"),
         (Bar(0, length=1.0), {"length": 2.0}, "is already an object: it cannot take length"),
-        (3, {}, "a shape must be a subclass of .*int"),
+        (3, {}, "a shape must be a registered name, .* a subclass of .*Shape or an object of one, got 3"),
         (
             "disc",
             {"raduis": 1},

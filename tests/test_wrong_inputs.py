@@ -13,8 +13,10 @@ import yaml
 
 import softgym_envs  # noqa: F401 - registers the environments
 from softgym_envs import make_robot
-from softgym_envs.agents.config import TrainConfig
+from softgym_envs.agents.config import EnvironmentConfig, TrainConfig
+from softgym_envs.agents.evaluation import evaluate
 from softgym_envs.agents.policy import Policy
+from softgym_envs.backends import make_backend
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.tools.config import CalibrationConfig, OptimiseConfig
 from softgym_envs.config import load_config
@@ -30,6 +32,7 @@ from softgym_envs.testing import box_mesh
 ROOT = Path(__file__).resolve().parent.parent
 NODES, TETRAHEDRA = box_mesh((0.1, 0.02, 0.02), (4, 1, 1))
 REACH = "SoftGym/FingerReach-v0"
+ENVIRONMENT, GOALS = EnvironmentConfig(id=REACH), [[0.0, 0.05, -0.1]]
 
 
 def body(nodes=NODES, **options):
@@ -54,6 +57,12 @@ def reset(**options):
         env.reset(seed=0, options=options)
     finally:
         env.close()
+
+
+def act(action):
+    env = gymnasium.make(REACH)
+    env.reset(seed=0)
+    env.step(action)
 
 
 def config(folder, model, name, *overrides):
@@ -113,7 +122,23 @@ MISTAKES = {
         lambda _: body(poisson_ratio=45.0),
         "poisson_ratio = 45.0 must be inside (-1, 0.5)",
     ),
+    "elements in millimetres": (
+        lambda _: make_robot("finger", mesh_size=5),
+        "robot 'finger': mesh_size = 5 m is larger than the robot, whose size is 0.12 m; did you mean metres?",
+    ),
+    "pulls in millimetres": (
+        lambda _: make_backend("surrogate", make_robot("finger")).step([4.0, 1.0]),
+        "command = 4 m of actuator 'cable_1' is far beyond its range; allowed: 0 to 0.02 m",
+    ),
+    "one of several bodies in millimetres": (
+        lambda _: gymnasium.make_vec(REACH, num_envs=2).reset(options={"design": [{}, {"length": 40.0}]}),
+        "sub-environment 1: design variable 'length' = 40 m is out of bounds; allowed: 0.038 to 0.042 m",
+    ),
     # Names
+    "agent": (
+        lambda _: evaluate("qpp", ENVIRONMENT, GOALS),
+        "unknown agent 'qpp'; did you mean 'qp'? allowed too: a policy file (.safetensors)",
+    ),
     "robot": (
         lambda _: make_robot("fingr"),
         "unknown robot 'fingr'; did you mean 'finger'? allowed: finger, diamond, *",
@@ -188,11 +213,37 @@ MISTAKES = {
     ),
     "name without a list": (
         lambda _: gymnasium.make(REACH, sample_design="length"),
-        "design variables = 'length' must be True, False or a list of names, such as ['length']",
+        "sample_design = 'length' must be True, False or a list of names, such as ['length']",
     ),
     "option that only the environment takes": (
         lambda _: gymnasium.make(REACH, bakend="fem"),
         "unknown environment option 'bakend'; did you mean 'backend'? allowed: robot, task, backend, render_mode, *",
+    ),
+    # Kinds
+    "ID in place of a configuration": (
+        lambda _: evaluate("qp", REACH, GOALS),
+        f"environment = '{REACH}' must be an EnvironmentConfig, such as EnvironmentConfig(id=ID)",
+    ),
+    "number in place of a robot": (
+        lambda _: make_robot(3),
+        "a robot must be a registered name, 'module:class', a subclass of *Robot or an object of one, got 3",
+    ),
+    "bodies in place of a body": (
+        lambda _: gymnasium.make_vec(REACH, num_envs=2, design=[{}, {}]),
+        "design is one body for all episodes, got 2; give a body for each sub-environment in "
+        "reset(options={'design': [...]})",
+    ),
+    "action that is no number": (
+        lambda _: act("left"),
+        "action = 'left' must be numbers; allowed: -1 to 1",
+    ),
+    "command that is no number": (
+        lambda _: make_backend("surrogate", make_robot("finger")).step("left"),
+        "command must be 2 finite numbers, got 'left'",
+    ),
+    "state of nothing": (
+        lambda _: gymnasium.make(REACH).unwrapped.set_state({}),
+        "state = {} must be what get_state returned",
     ),
     # Values
     "range of an actuator": (

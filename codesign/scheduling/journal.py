@@ -2,20 +2,58 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from softgym_envs.codesign.scheduling.storage import StudyStorage, file_lock
+from softgym_envs.errors import DataError
 from softgym_envs.storage import drop_torn_line
 
 if TYPE_CHECKING:
     import optuna
+    from filelock import BaseFileLock
 
 JOURNAL_LOCK = "journal"
 
 T = TypeVar("T")
+
+
+def open_journal(path: Path, lock: BaseFileLock | None = None) -> optuna.storages.JournalStorage:
+    """Return Optuna's journal in a file, without a last line that a crash cut off.
+
+    Args:
+        path: the file, which is made if it does not exist.
+        lock: what its writers hold; default Optuna's own lock file.
+
+    Raises:
+        DataError: if a line is not a record of a journal.
+    """
+    from optuna import storages
+    from optuna.storages.journal import JournalFileBackend
+
+    # Nobody else writes while we hold the lock, so a crash cut this line off and nobody has acted on it.
+    with lock or nullcontext():
+        drop_torn_line(path)
+    try:
+        return storages.JournalStorage(JournalFileBackend(str(path), lock_obj=lock))  # type: ignore[arg-type]
+    except (ValueError, KeyError, TypeError):
+        for number, line in enumerate(path.read_bytes().splitlines(), start=1):
+            if not _is_record(line):
+                raise DataError(
+                    f"'{path}' cannot be read: line {number} is damaged; restore the file from a copy, or begin anew "
+                    "in another folder"
+                ) from None
+        raise
+
+
+def _is_record(line: bytes) -> bool:
+    try:
+        return "op_code" in json.loads(line)
+    except (ValueError, TypeError):
+        return False
 
 
 class JournalStorage(StudyStorage):
@@ -29,16 +67,8 @@ class JournalStorage(StudyStorage):
         self._optuna = self._open()
 
     def _open(self) -> optuna.storages.BaseStorage:
-        from optuna import storages
-        from optuna.storages.journal import JournalFileBackend
-
-        path = self.folder / "journal.log"
-        lock = file_lock(self.folder, JOURNAL_LOCK)
-        with lock:
-            # Nobody else writes while we hold the lock, so a crash cut this line off and nobody has acted on it.
-            drop_torn_line(path)
         # Unlike Optuna's own lock files, these are freed by the kernel when their holder is killed.
-        return storages.JournalStorage(JournalFileBackend(str(path), lock_obj=lock))  # type: ignore[arg-type]
+        return open_journal(self.folder / "journal.log", file_lock(self.folder, JOURNAL_LOCK))
 
     @property
     def optuna(self) -> optuna.storages.BaseStorage:

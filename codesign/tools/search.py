@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softgym_envs.codesign.sampling import make_sampler
+from softgym_envs.codesign.scheduling.journal import open_journal
 from softgym_envs.codesign.tools.config import OptimiseConfig, SearchConfig
 from softgym_envs.codesign.tools.evaluation import Evaluation, evaluate_each
 from softgym_envs.codesign.tools.folder import run_folder
@@ -18,7 +19,7 @@ from softgym_envs.codesign.tools.plots import draw_front
 from softgym_envs.codesign.tools.records import FrontDesign, SearchResult
 from softgym_envs.config import provenance
 from softgym_envs.errors import ConvergenceError
-from softgym_envs.storage import atomic_write, drop_torn_line, write_json
+from softgym_envs.storage import atomic_write, write_json
 
 if TYPE_CHECKING:
     import optuna
@@ -60,16 +61,14 @@ class _Search:
 
     def __init__(self, config: OptimiseConfig, folder: Path) -> None:
         import optuna
-        from optuna.storages.journal import JournalFileBackend
 
         assert isinstance(config.solver, SearchConfig)
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         self.config, self.solver = config, config.solver
         self.box = config.bodies.box()
-        drop_torn_line(folder / "journal.log")
         self._study = optuna.create_study(
             study_name="search",
-            storage=optuna.storages.JournalStorage(JournalFileBackend(str(folder / "journal.log"))),
+            storage=open_journal(folder / "journal.log"),
             load_if_exists=True,
             directions=["minimize"] * len(config.objectives),
             sampler=make_sampler(self.solver.sampler, 0),

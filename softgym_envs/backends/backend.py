@@ -15,6 +15,9 @@ from softgym_envs.mechanics.contact.contact import Contacts
 from softgym_envs.mechanics.solvers.dynamics import Motion
 from softgym_envs.robots.base import Robot
 
+#: Displacements beyond this many times the range of their actuator are taken for a mistake in the unit.
+FAR_BEYOND = 10.0
+
 
 class _Evaluated:
     """Field of `State` that also takes a function, which is called when the field is first read."""
@@ -130,9 +133,30 @@ def check_numbers(name: str, values: object, count: int) -> np.ndarray:
     Raises:
         ValueError: unless they are ``count`` finite numbers.
     """
-    array = np.asarray(values, dtype=float)
+    wanted = f"{name} must be {count} finite number{'s' * (count > 1)}"
+    try:
+        array = np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        raise ValueError(f"{wanted}, got {values!r}") from None
     if array.shape != (count,) or not np.isfinite(array).all():
-        raise ValueError(f"{name} must be {count} finite number{'s' * (count > 1)}, got {array.tolist()}")
+        raise ValueError(f"{wanted}, got {array.tolist()}")
+    return array
+
+
+def check_command(robot: Robot, command: object, mode: str) -> np.ndarray:
+    """Return a command as an array (n_a,).
+
+    Raises:
+        ValueError: unless it is finite numbers, one for each actuator; or for a displacement so far beyond the range of
+            its actuator that its unit is probably wrong.
+    """
+    array = check_numbers("command", command, len(robot.actuators))
+    for actuator, value in zip(robot.actuators, array.tolist(), strict=True):
+        if mode == "displacement" and abs(value) > FAR_BEYOND * max(abs(actuator.low), abs(actuator.high)):
+            raise ValueError(
+                f"command = {value:g} {actuator.unit} of actuator '{actuator.name}' is far beyond its range; "
+                f"allowed: {actuator.low:g} to {actuator.high:g} {actuator.unit}"
+            )
     return array
 
 

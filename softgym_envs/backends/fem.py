@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from softgym_envs.backends.backend import Backend, PointForce, Snapshot, State, check_numbers
+from softgym_envs.backends.backend import Backend, PointForce, Snapshot, State, check_command, check_numbers
 from softgym_envs.backends.time_steps import TimeSteps
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import ContactModel
@@ -206,7 +206,7 @@ class FEMBackend(Backend):
     def _checked(self, command: np.ndarray, mode: str) -> np.ndarray:
         if mode not in ("displacement", "effort"):
             raise ValueError(f"mode = {mode!r} is unknown; allowed: 'displacement', 'effort'")
-        return check_numbers("command", command, len(self.largest_efforts))
+        return check_command(self.robot, command, mode)
 
     def probe(self, command: np.ndarray, mode: str = "displacement") -> State:
         """Return the static equilibrium under a command, found from the present shape, without going there."""

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from softgym_envs.backends.backend import Backend, PointForce, Snapshot, State, check_numbers, refuse_force
+from softgym_envs.backends.backend import Backend, PointForce, Snapshot, State, check_command, refuse_force
 from softgym_envs.backends.batch import BatchBackend, BatchState
 from softgym_envs.backends.surrogate_motion import MotionState, SurrogateMotion
 from softgym_envs.backends.time_steps import TimeSteps
@@ -173,7 +173,7 @@ class SurrogateBody:
             ConvergenceError: if the search does not find it.
             ValueError: for a malformed command.
         """
-        command = check_numbers("command", command, self.model.count)
+        command = check_command(self.model.robot, command, mode)
         place = start.displacement[None]
         if mode == "displacement":
             found = solve_displacements(
@@ -197,7 +197,7 @@ class SurrogateBody:
             ValueError: for a malformed command, or for commanded efforts.
         """
         assert self._motion is not None
-        command = check_numbers("command", command, self.model.count)
+        command = check_command(self.model.robot, command, mode)
         if mode != "displacement":
             raise ValueError(f"mode = {mode!r} is not available in motion on the surrogate; allowed: 'displacement'")
         moved, found = self._motion.advance(

@@ -75,8 +75,8 @@ def evaluate(
     """
     from softgym_envs.agents.baselines import BASELINES
     from softgym_envs.agents.config import TrainConfig
+    from softgym_envs.agents.evaluation import check_agent, sample_goals
     from softgym_envs.agents.evaluation import evaluate as run
-    from softgym_envs.agents.evaluation import sample_goals
     from softgym_envs.agents.policy import Policy
     from softgym_envs.config import load_config, provenance
     from softgym_envs.storage import write_json
@@ -88,7 +88,7 @@ def evaluate(
     if workers < 1:
         raise ConfigError(f"--workers {workers} must be at least 1")
     for agent in agents:  # reject an invalid policy before any evaluation
-        options.check_agent(agent)
+        check_agent(agent)
         if agent not in BASELINES:
             Policy(agent).check_environment(environment)
     points = sample_goals(environment.model_copy(update={"sample_design": False}), goals, seed, chosen)

@@ -84,7 +84,7 @@ def rollout(
 ) -> None:
     """Run one episode and print its result."""
     import softgym_envs  # noqa: F401 - registers the IDs
-    from softgym_envs.agents.evaluation import make_agent
+    from softgym_envs.agents.evaluation import check_agent, make_agent
     from softgym_envs.surrogate.domain import doubt_text
 
     if record is not None and video is not None:
@@ -96,7 +96,7 @@ def rollout(
 
         check_video(video)  # before the work begins
     chosen = options.design_of(design)
-    options.check_agent(agent)
+    check_agent(agent)
     config = _environment(environment, agent, backend, "rollout")
     act = make_agent(agent, seed)
     drawn = {"render_mode": "rgb_array"} if video is not None else {}
@@ -153,11 +153,12 @@ def record(
     NAME is the name of the dataset, such as softgym/finger-reach/qp-v0.
     """
     import softgym_envs  # noqa: F401 - registers the IDs
+    from softgym_envs.agents.evaluation import check_agent
     from softgym_envs.agents.offline import record_episodes
 
     if episodes < 1:
         raise ConfigError(f"--episodes {episodes} must be at least 1")
-    options.check_agent(agent)
+    check_agent(agent)
     config = _environment(environment, agent, backend, "record")
     chosen = options.design_of(design) or None
     dataset = record_episodes(name, agent, config, episodes=episodes, design=chosen, seed=seed)

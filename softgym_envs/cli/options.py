@@ -115,23 +115,6 @@ def resumable() -> Iterator[None]:
         raise Resumable from None
 
 
-def check_agent(name: str) -> None:
-    """Check that an agent is a baseline, a shipped policy or a file.
-
-    Raises:
-        ConfigError: with the nearest name, and the allowed ones.
-    """
-    from softgym_envs.agents.baselines import BASELINES
-    from softgym_envs.agents.policy import POLICY_FILE, shipped_policies
-
-    names = [*BASELINES, *shipped_policies()]
-    policy = Path(name) / "policy.safetensors"
-    if name not in names and policy.exists():
-        raise ConfigError(f"agent '{name}' is the folder of a training; its policy is {policy}")
-    if name not in names and not name.endswith(".safetensors"):
-        raise ConfigError(unknown_name("agent", name, names, other=POLICY_FILE))
-
-
 def complete_environment(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
     """Return the IDs of environments that begin with ``incomplete``, for completion in the shell."""
     from softgym_envs.envs.registration import ENVIRONMENTS

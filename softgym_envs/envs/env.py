@@ -20,6 +20,7 @@ from softgym_envs.designs import Design
 from softgym_envs.envs.options import EnvironmentOptions, check_reset_options, set_up
 from softgym_envs.envs.plant import Plant, Sensed, sensed, stiffened
 from softgym_envs.envs.spaces import squash
+from softgym_envs.envs.tasks.base import check_drawn
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 
 if TYPE_CHECKING:
@@ -208,7 +209,9 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             self.backend.reset(design)
         self._begin_plant()
         self._show(design)
-        self._path = self.task.sample(self.np_random, 1, self._kinematics)[0] if path is None else path
+        if path is None:
+            path = check_drawn(self.task, self.task.sample(self.np_random, 1, self._kinematics), 1)[0]
+        self._path = path
         self.task.begin(self.np_random)
         self._step = 0
         if self.render_mode == "human":
@@ -252,8 +255,11 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             Observation and info of that moment.
 
         Raises:
-            ValueError: for a state of another robot, task or backend, or of a robot or task with other options.
+            ValueError: for what is not a state, or a state of another robot, task or backend, or of a robot or task
+                with other options.
         """
+        if not isinstance(state, EpisodeState):
+            raise ValueError(f"state = {state!r:.80} must be what get_state returned")
         for kind, name, own in (("robot", state.robot, self.robot.name), ("task", state.task, self.task.name)):
             if name != own:
                 raise ValueError(f"the state belongs to {kind} '{name}', but the environment has {kind} '{own}'")

@@ -158,9 +158,9 @@ def set_up(robot: RobotSource | None, task: TaskSource, backend: str | None, opt
         task=make_task(task, made, **{**defaults.get("task_options", {}), **(options.task_options or {})}),
         backend=backend,
         backend_options=backend_options,
-        design=space.complete(options.design),
-        sampled=design_names(space, options.sample_design),
-        shown=design_names(space, options.design_in_observation),
+        design=_fixed_design(space, options.design),
+        sampled=design_names(space, options.sample_design, "sample_design"),
+        shown=design_names(space, options.design_in_observation, "design_in_observation"),
         action_mode=options.action_mode,
         plants=Plants.check(plant or None, made, backend, moving=bool(backend_options.get("dynamics", False))),
     )
@@ -173,7 +173,21 @@ def default_backend(robot: Robot, backend_options: Mapping[str, Any]) -> str:
     return "surrogate" if "weights" in backend_options or ships_weights(robot) else "fem"
 
 
-def design_names(space: DesignSpace, choice: bool | Sequence[str]) -> tuple[str, ...]:
+def _fixed_design(space: DesignSpace, design: Mapping[str, float] | None) -> Design:
+    """Return the body of all episodes.
+
+    Raises:
+        DesignError: for a malformed design, or a list of them.
+    """
+    if isinstance(design, list | tuple) and design and isinstance(design[0], Mapping):
+        raise DesignError(
+            f"design is one body for all episodes, got {len(design)}; give a body for each sub-environment in "
+            "reset(options={'design': [...]})"
+        )
+    return space.complete(design)
+
+
+def design_names(space: DesignSpace, choice: bool | Sequence[str], option: str) -> tuple[str, ...]:
     """Return the variables in an option that is False, True (all variables) or a list of names.
 
     Raises:
@@ -183,12 +197,10 @@ def design_names(space: DesignSpace, choice: bool | Sequence[str]) -> tuple[str,
         return space.names if choice else ()
     if isinstance(choice, str) or not isinstance(choice, Iterable):
         example = choice if isinstance(choice, str) else space.names[0]
-        raise DesignError(
-            f"design variables = {choice!r} must be True, False or a list of names, such as [{example!r}]"
-        )
+        raise DesignError(f"{option} = {choice!r} must be True, False or a list of names, such as [{example!r}]")
     names = tuple(space[name].name for name in choice)
     if len(set(names)) < len(names):
-        raise DesignError(f"design variables = {list(names)} must differ from each other")
+        raise DesignError(f"{option} = {list(names)} must differ from each other")
     return names
 
 
@@ -279,6 +291,34 @@ def check_design_option(design: Any, count: int) -> list[Any] | None:
     if len(design) != count:
         raise ValueError(f"design must be one body or a list of {count}, got {len(design)}")
     return list(design)
+
+
+def complete_bodies(
+    space: DesignSpace,
+    design: Mapping[str, float] | Sequence[Mapping[str, float]],
+    base: Mapping[str, float],
+    rows: np.ndarray,
+) -> np.ndarray:
+    """Return bodies of sub-environments, shape (len(rows), len(space)).
+
+    Args:
+        space: design space of the robot.
+        design: one body, or one for each row.
+        base: values of variables that are missing.
+        rows: numbers of the sub-environments.
+
+    Raises:
+        DesignError: for a malformed body, with its row where there are several.
+    """
+    if isinstance(design, Mapping):
+        return np.tile(space.complete(design, base).array, (len(rows), 1))
+    bodies = np.empty((len(rows), len(space)))
+    for k, (row, body) in enumerate(zip(rows.tolist(), design, strict=True)):
+        try:
+            bodies[k] = space.complete(body, base).array
+        except DesignError as error:
+            raise DesignError(f"sub-environment {row}: {error}") from None
+    return bodies
 
 
 def check_counts(num_envs: int, max_episode_steps: int | None) -> None:

@@ -90,7 +90,10 @@ class AgentSpaces:
         Raises:
             ValueError: for a wrong shape or a value that is not finite.
         """
-        action = np.asarray(action, dtype=float)
+        try:
+            action = np.asarray(action, dtype=float)
+        except (TypeError, ValueError):
+            raise ValueError(f"action = {action!r} must be numbers; allowed: -1 to 1") from None
         shape = action.shape[:-1] + self.action_space.shape
         if action.ndim == 0 or action.shape != shape:
             raise ValueError(f"action must have shape {self.action_space.shape}, got {action.shape}")

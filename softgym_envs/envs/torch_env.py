@@ -31,6 +31,7 @@ from softgym_envs.envs.options import (
     check_counts,
     check_design_option,
     check_reset_options,
+    complete_bodies,
     joined_seed,
     set_up,
     take_reset_mask,
@@ -287,7 +288,7 @@ class TorchVectorEnv(VectorEnv[Tensor, Tensor, Tensor]):
         if isinstance(bodies, Sequence) and all(isinstance(body, Mapping) for body in bodies):
             check_design_option(design, self.num_envs)
             fixed = dict(zip(self.design_space.names, self._fixed.tolist(), strict=True))
-            values = np.array([self.design_space.complete(body, fixed).array for body in bodies])
+            values = complete_bodies(self.design_space, design, fixed, np.arange(len(bodies)))
         else:
             values = np.asarray(design, dtype=float)
             shape = (self.num_envs, len(self.design_space))

@@ -24,11 +24,13 @@ from softgym_envs.envs.options import (
     check_counts,
     check_design_option,
     check_reset_options,
+    complete_bodies,
     joined_seed,
     set_up,
     take_reset_mask,
 )
 from softgym_envs.envs.plant import Sensed, sensed
+from softgym_envs.envs.tasks.base import check_drawn
 from softgym_envs.errors import InfeasibleDesign
 from softgym_envs.mechanics.condensation import CondensedModel
 
@@ -168,8 +170,7 @@ class SoftRobotVectorEnv(VectorEnv):
     ) -> None:
         """Start episodes in the sub-environments ``index``."""
         if design is not None:
-            given = [design] * len(index) if isinstance(design, Mapping) else design
-            designs = np.array([self.design_space.complete(d, self._fixed_design).array for d in given])
+            designs = complete_bodies(self.design_space, design, self._fixed_design, index)
             self._changed[index] = True  # also if some of the bodies cannot exist
             for error in self._begin_bodies(index, designs).values():
                 raise error
@@ -189,7 +190,8 @@ class SoftRobotVectorEnv(VectorEnv):
         if goal is not None:
             paths = goal
         else:
-            paths = self.task.sample(self.np_random, len(index), partial(self.backend.effectors, index))
+            drawn = self.task.sample(self.np_random, len(index), partial(self.backend.effectors, index))
+            paths = check_drawn(self.task, drawn, len(index))
         missing = paths.shape[1] - self._paths.shape[1]
         if missing > 0:
             self._paths = np.pad(self._paths, ((0, 0), (0, missing), (0, 0)))

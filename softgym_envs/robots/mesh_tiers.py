@@ -42,10 +42,12 @@ class MeshTier:
     fillet: float = 0.0
     guide_radius: float = 0.0
 
-    def changed(self, robot: str, *, size: float | None, element: str | None, fillet: float | None) -> MeshTier:
+    def changed(
+        self, robot: str, *, size: float | None, element: str | None, fillet: float | None, largest: float = np.inf
+    ) -> MeshTier:
         """Return a tier in which the options that are given replace those of this one.
 
-        With a ``size``, all sizes change in the same proportion.
+        With a ``size``, all sizes change in the same proportion. No length may exceed ``largest`` [m].
 
         Raises:
             ValueError: naming the robot and the option that is not allowed.
@@ -57,6 +59,12 @@ class MeshTier:
             raise ValueError(f"robot '{robot}': mesh_size = {size!r} m must be positive and finite")
         if not (isinstance(fillet, int | float) and 0.0 <= fillet < np.inf):
             raise ValueError(f"robot '{robot}': fillet = {fillet!r} m must be finite and not negative")
+        for name, length in (("mesh_size", size), ("fillet", fillet)):
+            if length > largest:
+                raise ValueError(
+                    f"robot '{robot}': {name} = {length:g} m is larger than the robot, whose size is {largest:g} m; "
+                    "did you mean metres?"
+                )
         if element not in SOLIDS:
             raise ValueError(unknown_name("element", element, SOLIDS))
         scaled = None if self.feature_size is None else self.feature_size * size / self.size

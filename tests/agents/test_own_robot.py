@@ -69,6 +69,11 @@ def test_your_own_robot_is_trained_and_evaluated(module, tmp_path):
         policy.check_environment(EnvironmentConfig(robot="spiky:Spike", task="reach"))
 
 
+def test_weights_of_your_own_make_a_surrogate(module, tmp_path):
+    own = EnvironmentConfig(robot=f"{module}:Spike", task="reach", backend_options={"weights": tmp_path})
+    assert own.backend == "surrogate" and own.has_surrogate
+
+
 def test_classes_are_stored_as_paths():
     environment = EnvironmentConfig(robot=SoftFinger, task="reach", max_episode_steps=3)
     assert environment.robot == "softgym_envs.robots.soft_finger:SoftFinger"

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 
+import optuna
 import pytest
 from optuna.trial import TrialState
 
 from softgym_envs.codesign.records import TrialResult
-from softgym_envs.codesign.scheduling.journal import JOURNAL_LOCK
+from softgym_envs.codesign.scheduling.journal import JOURNAL_LOCK, open_journal
 from softgym_envs.codesign.scheduling.optuna_study import open_study
 from softgym_envs.codesign.scheduling.queue import TrialQueue
+from softgym_envs.errors import DataError
 
 
 def die(queue):
@@ -137,6 +139,16 @@ def test_journal_with_a_torn_line(study):
         assert journal.read_bytes() == whole
         queue.finish(result(queue.claim()))
         assert states(queue) == ["COMPLETE", "COMPLETE"]
+
+
+@pytest.mark.parametrize("line", [b"{", b"3", b"{}", b"\xff"])
+def test_a_damaged_line_of_the_journal_is_named(line, tmp_path):
+    path = tmp_path / "journal.log"
+    optuna.create_study(study_name="any", storage=open_journal(path)).set_user_attr("name", "value")
+    first, *rest = path.read_bytes().splitlines(keepends=True)
+    path.write_bytes(first + line + b"\n" + b"".join(rest))
+    with pytest.raises(DataError, match=r"journal\.log' cannot be read: line 2 is damaged"):
+        open_journal(path)
 
 
 def test_lock_left_by_a_killed_process_is_free(study):

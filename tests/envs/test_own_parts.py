@@ -90,6 +90,28 @@ def test_your_own_task_in_every_environment():
     assert rewards == pytest.approx([rewards[0]] * 3, abs=1e-4)
 
 
+@pytest.mark.parametrize(
+    ("drawn", "message"),
+    [
+        (np.zeros((1, 3)), r"sample of task 'drawn'.* paths of shape \(1, 1, 3\), got \(1, 3\)"),
+        (np.full((1, 5, 3), 0.05), r"horizon = 1, must return paths of shape \(1, 1, 3\), got \(1, 5, 3\)"),
+        (np.full((1, 1, 3), np.nan), "returned a goal that is not finite; kinematics gives NaN for commands without"),
+    ],
+)
+def test_goals_that_a_task_draws_are_checked(drawn, message):
+    class Drawn(Reach):
+        name = "drawn"
+
+        def sample(self, rng, count, kinematics):
+            return drawn
+
+    single = gymnasium.make("SoftGym/FingerReach-v0", task=Drawn)
+    batch = gymnasium.make_vec("SoftGym/FingerReach-v0", num_envs=1, task=Drawn)
+    for env in (single, batch):
+        with pytest.raises(ValueError, match=message):
+            env.reset(seed=0)
+
+
 def test_batched_environments_need_a_surrogate():
     with pytest.raises(ValueError, match=r"backend = 'fem' of robot 'spike' has no batched environment.*processes"):
         SoftRobotVectorEnv(Spike)

@@ -89,6 +89,27 @@ def check_goals(goals: object, name: str, robot: Robot, leading: tuple[int, ...]
     return robot.check_point(name, array)
 
 
+def check_drawn(task: Task, paths: Array, count: int) -> Array:
+    """Return the paths that a task has drawn.
+
+    Raises:
+        ValueError: unless they are finite and have the shape (count, p, 3), with p = 1 for a task with one goal.
+    """
+    shape = tuple(paths.shape)
+    longest = 1 if task.horizon == 1 else np.inf
+    if len(shape) != 3 or shape[0] != count or shape[2] != 3 or not 1 <= shape[1] <= longest:
+        wanted = f"({count}, {'1' if longest == 1 else 'p'}, 3)"
+        raise ValueError(
+            f"sample of task '{task.name}', horizon = {task.horizon}, must return paths of shape {wanted}, got {shape}"
+        )
+    if not np.isfinite(paths).all():
+        raise ValueError(
+            f"sample of task '{task.name}' returned a goal that is not finite; kinematics gives NaN for commands "
+            "without an equilibrium, which have to be drawn again"
+        )
+    return paths
+
+
 def check_length(value: float, name: str, robot: Robot) -> float:
     """Return a length [m] that goals are moved by.
 
@@ -161,7 +182,13 @@ class Task(ABC):
 
     @abstractmethod
     def sample(self, rng: Random, count: int, kinematics: Kinematics) -> Array:
-        """Draw the goals of ``count`` episodes: paths [m], shape (count, p, 3); p = 1 for a fixed goal."""
+        """Draw the goals of ``count`` episodes: paths [m], shape (count, p, 3); p = 1 for a fixed goal.
+
+        Args:
+            rng: the generator to draw from.
+            count: number of episodes.
+            kinematics: maps commands (B, n_a) to effectors (B, 3) [m]; NaN for commands without an equilibrium.
+        """
 
     def goals(self, paths: Array, counts: Array, steps: Array) -> Array:
         """Return the goals [m] (B, 3) at control steps (B,) of paths (B, p, 3), which are spread over the horizon.
