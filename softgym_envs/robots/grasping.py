@@ -183,7 +183,12 @@ def evaluate_grasp(
         contact = model.set_contact(
             obstacles=[target.obstacle(robot.width), *robot.obstacles],
             excluded=np.flatnonzero(model.nodes[:nodes, 1] < HELD + 1e-9),
-            settings=ContactSettings(True, self_friction, robot.contact_distance, robot.contact_stiffness),
+            settings=ContactSettings(
+                self_contact=True,
+                self_friction=self_friction,
+                distance=robot.contact_distance,
+                stiffness=robot.contact_stiffness,
+            ),
         )
         if crossing := contact.intersections(model.nodes):
             raise InfeasibleDesign(f"{crossing} at rest")
