@@ -89,7 +89,7 @@ def test_the_controller_of_a_robot_does_not_command_more_than_its_actuators_give
 
 
 def test_steps_within_the_largest_efforts_are_feasible():
-    """Scaled steps of an arm from rest: with its default, ProxQP takes them for infeasible, although zero is allowed."""
+    """Scaled steps of an arm from rest: ProxQP takes them for infeasible by default, although zero is allowed."""
     one, largest = np.ones(2), np.array([0.991556, 36.682888])
     hessian = np.array([[0.530067917348048, -0.054871839491015886], [-0.054871839491015886, 0.46993208265195197]])
     rows = np.array([[0.9972379615535633, -0.002762038446436761], [-0.10218235056025814, 0.897817649439742]])
