@@ -222,6 +222,7 @@ class InverseQP:
         qp = self._proxqp.dense.QP(n, 0, n, True)
         qp.settings.eps_abs = 1e-11  # with many actuators for one effector, 1e-9 is inaccurate by 5e-5 of their ranges
         qp.settings.eps_rel = 0.0
+        qp.settings.eps_primal_inf = 1e-14  # the default 1e-4 takes programs with a solution for infeasible
         qp.settings.max_iter = 1000
         qp.settings.initial_guess = self._proxqp.InitialGuess.WARM_START_WITH_PREVIOUS_RESULT
         return qp

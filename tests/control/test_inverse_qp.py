@@ -88,6 +88,21 @@ def test_the_controller_of_a_robot_does_not_command_more_than_its_actuators_give
     np.testing.assert_allclose(command, state.displacement, rtol=1e-3)  # commands do not run ahead
 
 
+def test_steps_within_the_largest_efforts_are_feasible():
+    """Scaled steps of an arm from rest: ProxQP takes them for infeasible by default, although zero is allowed."""
+    one, largest = np.ones(2), np.array([0.991556, 36.682888])
+    hessian = np.array([[0.530067917348048, -0.054871839491015886], [-0.054871839491015886, 0.46993208265195197]])
+    rows = np.array([[0.9972379615535633, -0.002762038446436761], [-0.10218235056025814, 0.897817649439742]])
+    controller = InverseQP(-one, one, one, np.zeros(2, dtype=bool))
+    for gradient, expected in (
+        ([-3.386269, 6.899382], [0.991533, -1.0]),
+        ([-1.789015, -7.444005], [0.997072, 1.0]),
+    ):
+        program = (hessian, np.array(gradient), None, None, rows, -largest, largest, -one, one)
+        _, step = controller._solved(None, program)
+        np.testing.assert_allclose(step, expected, atol=1e-6)
+
+
 def test_one_step_is_the_least_squares_answer_where_no_bound_is_active(linear):
     """Against the normal equations, with W_ea, W_aa and the two weights written out."""
     linear.go(np.array([0.010, 0.006, 0.005]))
