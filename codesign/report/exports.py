@@ -89,9 +89,7 @@ def write_exports(
             if not path.exists():
                 write(path)
         except Exception as error:  # no exact shape, no ONNX, no OpenGL: the report is useful without the file
-            expected = isinstance(
-                error, (SoftGymError, ValueError)
-            )  # their messages say all
+            expected = isinstance(error, (SoftGymError, ValueError))  # their messages say all
             missing.append(f"Not written: {path.name}: {'' if expected else f'{type(error).__name__}: '}{error}")
         else:
             downloads.append(_download(folder, path.name, text))
