@@ -1,4 +1,4 @@
-"""Agents: SAC training, evaluation and baselines (inverse QP, random actions)."""
+"""Agents: training, evaluation and export of policies, and agents that need no training, such as the inverse QP."""
 
 from typing import TYPE_CHECKING
 

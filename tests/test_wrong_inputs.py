@@ -17,6 +17,7 @@ from softgym_envs.agents.config import EnvironmentConfig, TrainConfig
 from softgym_envs.agents.evaluation import evaluate
 from softgym_envs.agents.policy import Policy
 from softgym_envs.backends import make_backend
+from softgym_envs.codesign import measure
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.tools.config import CalibrationConfig, OptimiseConfig
 from softgym_envs.config import load_config
@@ -57,6 +58,11 @@ def reset(**options):
         env.reset(seed=0, options=options)
     finally:
         env.close()
+
+
+def touched(path):
+    path.touch()
+    return path
 
 
 def act(action):
@@ -245,7 +251,19 @@ MISTAKES = {
         lambda _: gymnasium.make(REACH).unwrapped.set_state({}),
         "state = {} must be what get_state returned",
     ),
+    "file of weights in place of their folder": (
+        lambda f: gymnasium.make(REACH, backend_options={"weights": touched(f / "model.safetensors")}),
+        "weights '*model.safetensors' are a file; give their folder: '*'",
+    ),
     # Values
+    "measurement of nothing": (
+        lambda _: measure(make_robot("finger"), {}, []),
+        "commands is empty; give one or more commands of the actuators",
+    ),
+    "measurement driven by something else": (
+        lambda _: measure(make_robot("finger"), {}, [[1.0, 1.0]], driven="force"),
+        "driven = 'force' is unknown; allowed: 'displacement', 'effort'",
+    ),
     "range of an actuator": (
         lambda _: Actuator("cable", low=0.02, high=0.0, rate=0.001),
         "actuator 'cable': low 0.02 must be below high 0, both finite",

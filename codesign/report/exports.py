@@ -13,6 +13,7 @@ from softgym_envs.codesign.phases.finalists import policy_file
 from softgym_envs.codesign.report.episodes import Episode
 from softgym_envs.codesign.report.results import StudyResults
 from softgym_envs.codesign.snapshot import StudySnapshot
+from softgym_envs.errors import SoftGymError
 from softgym_envs.robots.base import Robot
 
 EMBEDDED = 1_000_000
@@ -88,7 +89,8 @@ def write_exports(
             if not path.exists():
                 write(path)
         except Exception as error:  # no exact shape, no ONNX, no OpenGL: the report is useful without the file
-            missing.append(f"Not written: {path.name}: {type(error).__name__}: {error}")
+            expected = isinstance(error, (SoftGymError, ValueError))  # their messages say all
+            missing.append(f"Not written: {path.name}: {'' if expected else f'{type(error).__name__}: '}{error}")
         else:
             downloads.append(_download(folder, path.name, text))
     if policy is not None:

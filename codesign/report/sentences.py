@@ -151,7 +151,7 @@ def _problem(snapshot: StudySnapshot, results: StudyResults) -> list[tuple[str, 
     count = len(snapshot.folder.goals["selection"])
     rows = [
         ("Task", f"{results.environment}; success is {reached}"),
-        ("Body", f"{len(optimised)} variables: {ranges}"),
+        ("Body", f"{len(optimised)} variable{'s' * (len(optimised) != 1)}: {ranges}"),
         ("Objective", f"{objective.axis_inside} on {count} goals, {direction}"),
     ]
     if config.constraints:
@@ -228,7 +228,7 @@ def _origin_of_goals(snapshot: StudySnapshot) -> str:
     if goals.source == "family":
         vary = ", ".join(config.variables if goals.vary is None else goals.vary).replace("_", " ")
         low = f" above {100 * goals.command_low:.0f} % of their range" if goals.command_low else ""
-        return f"effector positions of random bodies ({vary} vary) under random commands{low}, the same for every body"
+        return f"effector positions of random bodies (varied: {vary}) under random commands{low}, equal for all bodies"
     if goals.zone is not None:
         center = ", ".join(f"{1e3 * v:g}" for v in goals.zone.center)
         half = ", ".join(f"{1e3 * v:g}" for v in goals.zone.half_size)

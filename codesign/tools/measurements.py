@@ -121,10 +121,14 @@ def measure(
         plane: a plane in the way of the first effector, on FEM.
 
     Raises:
-        ValueError: for a plane on a surrogate.
+        ValueError: for a plane on a surrogate, another value of ``driven`` or no commands.
         InfeasibleDesign: if the geometry cannot exist.
         ConvergenceError: if an equilibrium is not found.
     """
+    if driven not in ("displacement", "effort"):
+        raise ValueError(f"driven = {driven!r} is unknown; allowed: 'displacement', 'effort'")
+    if len(commands) == 0:
+        raise ValueError("commands is empty; give one or more commands of the actuators")
     physics = make_backend(backend, robot, design=design)
     imposed = [np.asarray(command, dtype=float) for command in commands]
     if plane is None:

@@ -489,7 +489,7 @@ class MeshedRobot(Robot):
         if not self.meshes and mesh_size is None:
             raise TypeError(f"robot '{self.name}' has no meshes by name: it needs a mesh_size [m]")
         tier = choose_mesh(self.meshes, mesh) if self.meshes else MeshTier(1.0)
-        given = {"size": mesh_size, "element": element, "fillet": fillet}
+        given: dict[str, Any] = {"size": mesh_size, "element": element, "fillet": fillet}
         self.tier = tier.changed(self.name, **given, largest=getattr(self, "size", np.inf))
         if self.tier.fillet and not self.rounded:
             raise ValueError(f"robot '{self.name}' cannot be drawn with a fillet: fillet = {fillet!r} m must be zero")

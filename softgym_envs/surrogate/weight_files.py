@@ -42,6 +42,8 @@ def read_weights(folder: str | Path, robot: Robot) -> tuple[dict[str, Any], dict
     from safetensors.numpy import load_file
 
     folder = Path(folder)
+    if folder.is_file():
+        raise WeightsError(f"weights '{folder}' are a file; give their folder: '{folder.parent}'")
     card_path, weights_path = folder / "model.json", folder / "model.safetensors"
     for path in (card_path, weights_path):
         if not path.is_file():
