@@ -31,6 +31,9 @@ from softgym_envs.testing import box_mesh
 
 MM = 1e-3
 
+BODIES = 5
+"""Random bodies of each robot besides its baseline."""
+
 
 @dataclass(frozen=True)
 class Study:
@@ -44,7 +47,6 @@ class Study:
         command: displacements of the actuators.
         options: further options of the robot.
         steps: increments in which the command is reached.
-        bodies: random bodies besides the baseline.
     """
 
     robot: str
@@ -53,7 +55,6 @@ class Study:
     command: tuple[float, ...]
     options: Mapping[str, Any]
     steps: int = 2
-    bodies: int = 5
 
 
 def scaled(size: float, ratio: float = 0.6) -> tuple[dict[str, dict[str, Any]], tuple[float, float, float]]:
@@ -79,7 +80,7 @@ TRUNK_LEVELS = {
 
 STUDIES = {
     "finger": Study("finger", *scaled(10 * MM), (10 * MM, 10 * MM), {"self_contact": False}),
-    "finger_sideways": Study("finger", *scaled(10 * MM), (10 * MM, 8 * MM), {"self_contact": False}, bodies=0),
+    "finger_sideways": Study("finger", *scaled(10 * MM), (10 * MM, 8 * MM), {"self_contact": False}),
     "finger_1cable": Study("finger", *scaled(10 * MM), (10 * MM,), {"cables": 1, "self_contact": False}),
     "diamond": Study("diamond", scaled(17 * MM)[0], None, (15 * MM, 0.0, 0.0, 0.0), {}, steps=4),
     "cable_trunk": Study(
@@ -89,14 +90,11 @@ STUDIES = {
         (15 * MM, 0.0, 0.0, 0.0, 5 * MM, 0.0, 0.0, 0.0),
         {},
         steps=3,
-        bodies=3,
     ),  # fmt: skip
-    "two_finger_gripper": Study("two_finger_gripper", *scaled(10 * MM), (6 * MM, 4 * MM, 4 * MM, 2 * MM), {}, bodies=1),
-    "two_finger_gripper_taut": Study(
-        "two_finger_gripper", *scaled(10 * MM), (10 * MM, 8 * MM, 8 * MM, 10 * MM), {}, bodies=0
-    ),
+    "two_finger_gripper": Study("two_finger_gripper", *scaled(10 * MM), (6 * MM, 4 * MM, 4 * MM, 2 * MM), {}),
+    "two_finger_gripper_taut": Study("two_finger_gripper", *scaled(10 * MM), (10 * MM, 8 * MM, 8 * MM, 10 * MM), {}),
     "three_finger_gripper": Study(
-        "three_finger_gripper", *scaled(10 * MM), (4 * MM, 2 * MM, 4 * MM, 2 * MM, 3 * MM, 3 * MM), {}, bodies=0
+        "three_finger_gripper", *scaled(10 * MM), (4 * MM, 2 * MM, 4 * MM, 2 * MM, 3 * MM, 3 * MM), {}
     ),
     "contact_aided_finger": Study("contact_aided_finger", *scaled(8 * MM), (math.radians(10.0),), {}),
     "trunk": Study("trunk", *beams((5, 10, 20)), (20e-9, 0.0, 0.0, 10e-9, 0.0, 0.0), {}),
@@ -175,7 +173,7 @@ def converge(name: str) -> dict[str, object]:
     rng = np.random.default_rng(17)
     first = next(iter(robots.values()))
     designs = {"baseline": first.design_space.baseline}
-    designs |= {str(k + 1): first.design_space.sample(rng) for k in range(study.bodies)}
+    designs |= {str(k + 1): first.design_space.sample(rng) for k in range(BODIES)}
     rows = []
     for body, design in designs.items():
         for mesh, robot in robots.items():

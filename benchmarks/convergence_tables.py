@@ -174,9 +174,23 @@ def finger_costs() -> str:
     return markdown(head, rows, "lrrrrrrrr")
 
 
+def point_meshes() -> str:
+    """What small elements at guides and contact points change on the mesh `accurate`."""
+    rows = []
+    for row in results("point_meshes")["rows"]:
+        before, tip = (", ".join(f"{x + 0.0:.2f}" for x in np.round(row[k], 2)) for k in ("tip before", "tip"))
+        cells = [percent(row["tip moved"]), percent(row["effort changed"]), f"{row['seconds']:.2g}"]
+        if row["failure"]:
+            tip, cells = "no equilibrium", [""] * len(cells)
+        rows.append([TITLES[row["study"]], row["points"], f"{row['unknowns']:,}", before, tip, *cells])
+    head = ["robot", "1 mm at", "unknowns", "tip, `accurate` [mm]", "tip [mm]", "moved", "effort", "CPU [s]"]
+    return markdown(head, rows, "llrrrrrr")
+
+
 CONVERGENCE_TABLES = {
     "convergence": convergence,
     "finger_costs": finger_costs,
+    "point_meshes": point_meshes,
     "convergence_limits": convergence_limits,
     "convergence_corrections": convergence_corrections,
     "convergence_guides": convergence_guides,
