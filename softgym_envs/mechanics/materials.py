@@ -52,7 +52,7 @@ class Material(ABC):
             lame: Lame's first parameter [Pa], shape (m,).
             energy: output [J/m3], shape (m,).
             stress: output dPsi/dF [Pa], shape (m, 9).
-            tangent: output d2Psi/dF2 [Pa], shape (m, 9, 9).
+            tangent: output d2Psi/dF2 [Pa], shape (m, 9, 9), or (0, 9, 9) if it is not needed.
 
         Returns:
             The number of inverted (det F <= 0) or non-finite gradients; the outputs are meaningless if not 0.
@@ -122,7 +122,7 @@ def _corotational(F, mu, lame, energy, stress, tangent):
                 new = upscale * r[k] + downscale * c[k]
                 change += (new - r[k]) ** 2
                 r[k] = new
-            if change < 1e-28:
+            if change < 1e-16:  # what is left is its square
                 converged = True
                 break
         if not converged:
@@ -151,6 +151,8 @@ def _corotational(F, mu, lame, energy, stress, tangent):
         d = _cofactor(s, g)
         if not abs(d) > 0.0:
             bad += 1
+            continue
+        if tangent.shape[0] == 0:
             continue
         inverse_d = 1.0 / d
         for i in range(3):
@@ -222,9 +224,12 @@ def _stable_neo_hookean(F, mu, lame, energy, stress, tangent):
         energy[e] -= 0.5 * la * (1.0 - alpha) ** 2 - 0.5 * m * math.log(4.0)
         a = m * (1.0 - 1.0 / (ic + 1.0))
         b = la * (J - alpha)
-        k2 = 2.0 * m / (ic + 1.0) ** 2
         for p in range(9):
             stress[e, p] = a * f[p] + b * c[p]
+        if tangent.shape[0] == 0:
+            continue
+        k2 = 2.0 * m / (ic + 1.0) ** 2
+        for p in range(9):
             for q in range(9):
                 tangent[e, p, q] = k2 * f[p] * f[q] + la * c[p] * c[q]
             tangent[e, p, p] += a

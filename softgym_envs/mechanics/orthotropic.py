@@ -91,6 +91,8 @@ def _evaluate(F, stiffness, scale, energy, stress, tangent):
             stress[e, q] = 0.0
             for p in range(6):
                 stress[e, q] += force[p] * slope[p, q]
+        if tangent.shape[0] == 0:
+            continue
         for p in range(6):
             for q in range(9):
                 half[p, q] = 0.0

@@ -72,6 +72,15 @@ def test_tangent_is_the_symmetric_derivative_of_the_stress(material, gradients, 
         assert (error <= 1e-6 * np.abs(tangent).max(axis=(1, 2))).all()
 
 
+def test_the_tangent_may_be_left_out(material, gradients):
+    energy, stress, _, _ = evaluate(material, gradients)
+    F, m = np.reshape(gradients, (-1, 9)), len(gradients)
+    alone = np.empty(m), np.empty((m, 9))
+    assert material.evaluate(F, np.full(m, MU), np.full(m, LAME), *alone, np.empty((0, 9, 9))) == 0
+    np.testing.assert_array_equal(alone[0], energy)
+    np.testing.assert_array_equal(alone[1], stress.reshape(-1, 9))
+
+
 @pytest.mark.parametrize(("mu", "lame"), ELASTICITIES)
 def test_rotations_store_no_energy(material, mu, lame):
     turned = np.concatenate([np.eye(3)[None], Rotation.random(50, random_state=3).as_matrix()])

@@ -43,6 +43,16 @@ def test_derivatives(gradients):
         np.testing.assert_allclose(tangent[:, :, k], (plus[1] - minus[1]) / (2 * h), atol=1e-8)
 
 
+def test_the_tangent_may_be_left_out(gradients):
+    material, m = Orthotropic(WOOD, AXES), len(gradients)
+    energy, stress, _, _ = evaluate(material, gradients)
+    alone, (mu, lame) = (np.empty(m), np.empty((m, 9))), lame_parameters(2.0, 0.3)
+    F = np.reshape(gradients, (-1, 9))
+    assert material.evaluate(F, np.full(m, mu), np.full(m, lame), *alone, np.empty((0, 9, 9))) == 0
+    np.testing.assert_array_equal(alone[0], energy)
+    np.testing.assert_array_equal(alone[1], stress)
+
+
 def test_rotations_of_space_and_of_the_material(gradients):
     """Rotating space changes nothing; a body cut out of the material in other directions has the turned axes."""
     material, turn = Orthotropic(WOOD), Rotation.random(random_state=2).as_matrix()

@@ -99,7 +99,8 @@ class AveragedTetrahedra(Tetrahedra):
         self, x: np.ndarray, gradient: np.ndarray, values: np.ndarray | None, scatter: list[np.ndarray] | None
     ) -> tuple[float, int]:
         deformation_gradients(x, self.connectivity, self.points, self.gradients, self._F)
-        inverted = self.material.evaluate(self._F, self.mu, self._zero, self._energy, self._stress, self._tangent)
+        tangent = self._tangent if values is not None else self._tangent[:0]
+        inverted = self.material.evaluate(self._F, self.mu, self._zero, self._energy, self._stress, tangent)
         if inverted:
             return np.inf, inverted
         theta, slope, curvature = self._dilation, self._dilation_gradient, self._dilation_hessian
@@ -111,8 +112,8 @@ class AveragedTetrahedra(Tetrahedra):
         add_forces(self.connectivity, self.points, self.gradients, self.weights, self._stress, gradient)
         if values is not None:
             assert scatter is not None
-            self._tangent += pressure[:, None, None] * curvature
-            self._add_stiffness(self._tangent, values, scatter)
+            tangent += pressure[:, None, None] * curvature
+            self._add_stiffness(tangent, values, scatter)
             _patch_gradients(self._element_slots, self._shares, self.gradients, slope, self._patch_gradient)
             _add_patches(
                 self._pointers, self._patch_gradient, lame * self._node_volumes, scatter[1], self._starts, values

@@ -315,13 +315,14 @@ class SolidBlock(ElementBlock):
         self, x: np.ndarray, gradient: np.ndarray, values: np.ndarray | None, scatter: list[np.ndarray] | None
     ) -> tuple[float, int]:
         deformation_gradients(x, self.connectivity, self.points, self.gradients, self._F)
-        inverted = self.material.evaluate(self._F, self.mu, self.lame, self._energy, self._stress, self._tangent)
+        tangent = self._tangent if values is not None else self._tangent[:0]
+        inverted = self.material.evaluate(self._F, self.mu, self.lame, self._energy, self._stress, tangent)
         if inverted:
             return np.inf, inverted
         add_forces(self.connectivity, self.points, self.gradients, self.weights, self._stress, gradient)
         if values is not None:
             assert scatter is not None
-            self._add_stiffness(self._tangent, values, scatter)
+            self._add_stiffness(tangent, values, scatter)
         return float(self._energy @ self.weights), 0
 
     def add_damping(

@@ -41,6 +41,8 @@ from softgym_envs.mechanics.solvers.equilibrium import (
 from softgym_envs.mechanics.solvers.linearisation import Linearisation
 from softgym_envs.mechanics.solvers.prediction import Bend, bend_of
 
+MOST_SIMPLIFIED = 3
+"""Simplified Newton corrections that together take less time than a factorisation and what it needs."""
 SHORT_STEP, MOST_SHORT_STEPS = 0.05, 6
 """In contact, an increment is divided after this number of steps in a row of less than this part of Newton's."""
 
@@ -95,6 +97,7 @@ class Statics:
         used = np.unique(np.concatenate([block.nodes_used for block in model.blocks]))  # not the directors of frames
         extent = float(np.linalg.norm(np.ptp(model.nodes[used], axis=0)))
         self._longest_step = 0.2 * extent  # with contact
+        self._short_step = 1e-3 * extent  # without contact: simplified corrections may reach the tolerance after it
         self._round_off = 1e-6 * extent  # steps this short no longer change the energy
         self.reset()
 
@@ -208,38 +211,30 @@ class Statics:
         linear = self.linearisation
         if not linear.current and not self._linearise():
             raise NewtonFailure
+        step_q, step_effort = self._correction(None, linear.delta, self.effort, target, driven)
+        if self._rests(step_q, step_effort, driven):
+            return 0
         if linear.contact is not None:
             return self._newton_in_contact(target, driven)
-        step_q, step_effort = self._correction(None, linear.delta, self.effort, target, driven)
         length = 1.0
         for iteration in range(1, self.max_iterations + 1):
             norm = self._norm(step_q)
             if not np.isfinite(norm):
                 raise NewtonFailure
             while True:
-                x = self.x + self._displacement(self.x, length * step_q)
+                most = MOST_SIMPLIFIED if norm <= self._short_step and length == 1.0 else 0
+                part = length * step_q
+                x = self.x + self._displacement(self.x, part)
                 effort = self.effort + length * step_effort
-                assembled = linear.assemble(x, effort)
+                assembled = linear.assemble(x, effort, tangent=not most)
                 if assembled is not None:
-                    Ar = linear.solve(assembled.residual)
-                    next_q, next_effort = self._correction(Ar, assembled.delta, effort, target, driven)
-                    remaining = self._norm(next_q)
+                    x, effort, assembled, _, remaining = self._polish(part, x, effort, assembled, target, driven, most)
                     # Near convergence, round-off dominates.
                     if remaining <= (1.0 - 0.25 * length) * norm or remaining <= self.tolerance:
                         break
                 length *= 0.5
                 if length < 1e-3:
                     raise NewtonFailure
-            contraction = remaining / norm if norm > 0.0 else 0.0
-            if length == 1.0 and remaining > self.tolerance and remaining * contraction <= 0.1 * self.tolerance:
-                # The simplified correction alone reaches the tolerance: take it and save a factorisation.
-                closer = x + self._displacement(x, next_q)
-                finished = linear.assemble(closer, effort + next_effort)
-                if finished is not None:
-                    x, effort, assembled = closer, effort + next_effort, finished
-                else:  # the failed assembly has overwritten the buffers
-                    assembled = linear.assemble(x, effort)
-                    assert assembled is not None
             self.x, self.effort = x, effort
             if not linear.factorise(assembled, x, definite=definite):
                 raise NewtonFailure
@@ -316,7 +311,8 @@ class Statics:
                     corrections += expected
             remaining = np.inf
             if full and polished:
-                x, effort, assembled, added, remaining = self._polish(x, effort, assembled, norm, target, driven)
+                taken = step_q if expected is None or iteration else step_q + expected
+                x, effort, assembled, added, remaining = self._polish(taken, x, effort, assembled, target, driven)
                 corrections += added
             self.x, self.effort = x, effort
             if iteration and remaining <= self.tolerance and linear.exact and not self.exact_compliance:
@@ -329,38 +325,43 @@ class Statics:
 
     def _polish(
         self,
+        step: np.ndarray,
         x: np.ndarray,
         effort: np.ndarray,
         assembled: Assembled,
-        norm: float,
         target: np.ndarray,
         driven: np.ndarray,
+        most: int = MOST_SIMPLIFIED,
     ) -> tuple[np.ndarray, np.ndarray, Assembled, np.ndarray, float]:
         """Apply simplified Newton corrections, if they alone can reach the tolerance: this saves a factorisation.
 
-        Rows ``x`` (n, 3), efforts (size,) and equations are those after a whole Newton step of largest displacement
-        ``norm`` [m]; for the rest see `_correction`.
+        They are added to the step before it is bent: elements have turned since the tangent was factorised, and a
+        straight correction would strain them by that turn. Rows ``x`` (n, 3), efforts (size,) and equations are those
+        after a ``step`` (N,), and ``most`` limits the corrections; for the rest see `_correction`.
 
         Returns:
-            Rows, efforts and equations; the sum of the corrections (N,); the largest displacement of the next [m].
+            Rows, efforts and equations; the sum of the corrections (N,); the largest displacement of the next [m], or
+            of the last where the exact tangent will tell whether it has sufficed.
         """
-        linear = self.linearisation
-        assert linear.contact is not None
-        total = np.zeros_like(assembled.residual)
-        while True:
+        linear, total, remaining = self.linearisation, np.zeros_like(step), self._norm(step)
+        for left in range(most, -1, -1):
             Ar = linear.solve(assembled.residual)
             step_q, step_effort = self._correction(Ar, assembled.delta, effort, target, driven)
-            remaining = self._norm(step_q)
-            if remaining <= self.tolerance or remaining**2 > 0.1 * self.tolerance * norm:
+            before, remaining = remaining, self._norm(step_q)
+            hopeful = remaining ** (left + 1) <= 0.25 * self.tolerance * before**left
+            if left == 0 or remaining <= self.tolerance or not hopeful:
                 break
-            closer = x + self.model.kinematics.displacement(x, step_q)  # too short to need warping
-            if linear.contact.free_path(x, closer) < 1.0:
+            closer = self.x + self._displacement(self.x, step + total + step_q)
+            if linear.contact is not None and linear.contact.free_path(x, closer) < 1.0:
                 break
-            x, effort, total, norm = closer, effort + step_effort, total + step_q, remaining
-            found = linear.assemble(x, effort, tangent=False)
+            last = self.exact_compliance and remaining**2 <= 0.25 * self.tolerance * before
+            x, effort, total = closer, effort + step_effort, total + step_q
+            found = linear.assemble(x, effort, tangent=last)
             if found is None:
                 raise NewtonFailure
             assembled = found
+            if last:
+                break
         return x, effort, assembled, total, remaining
 
     def _search(
@@ -410,17 +411,16 @@ class Statics:
             length *= 0.5
         return None
 
-    def _rests(self, goal: np.ndarray, driven: np.ndarray) -> bool:
-        """Whether the last equilibrium, at which it is linearised, is the commanded one; see `_correction`."""
+    def _rests(self, step_q: np.ndarray, step_effort: np.ndarray, driven: np.ndarray) -> bool:
+        """Whether the current state is the commanded equilibrium, from its correction; see `_correction`."""
         linear = self.linearisation
-        try:
-            step_q, step_effort = self._correction(None, linear.delta, self.effort, goal, driven)
-        except NewtonFailure:
+        # Friction starts anew from the last equilibrium, so it has to be solved for once more.
+        if not linear.exact or linear.rubs or np.delete(step_effort, driven).any():
             return False
-        if self._norm(step_q) > self.tolerance or np.delete(step_effort, driven).any():
+        if self._norm(step_q) > self.tolerance or self._norm(linear.response(step_effort)) > self.tolerance:
             return False
         self._displacement(self.x, step_q)  # raises ValueError for a part that nothing holds
-        return True
+        return self._buckling(driven, self.effort) in (0, linear.negative_eigenvalues)
 
     def _values(self, x: np.ndarray) -> np.ndarray:
         """Values of all constraints (size,) at rows ``x`` (n, 3)."""
@@ -481,9 +481,6 @@ class Statics:
             linear.current = False
         loads, start_loads = self.model.loads, self._current_loads
         linear.loads, ramped = start_loads, bool((loads != start_loads).any())
-        # Friction starts anew from the last equilibrium, so it has to be solved for once more.
-        if linear.current and linear.exact and not (ramped or linear.rubs) and self._rests(goal, driven):
-            return self._state(goal, driven, 0, 0)
         if not linear.current and not self._linearise():
             raise ConvergenceError("the starting state has inverted elements or a singular tangent", fraction=0.0)
 
