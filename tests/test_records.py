@@ -23,7 +23,6 @@ COMMIT = "[0-9a-f]{7,40}"
 ROOT = Path(__file__).parent.parent
 
 REWRITTEN = {
-    "agents/weights/gripper_pinch_designs_analytic/policy.json provenance",
     "benchmarks/data/recorded.json sensor_trials",
     "benchmarks/data/recorded.json zigzag_robust",
     "codesign/benchmark/data/references/cable-trunk-reach-v2.json found",
