@@ -87,8 +87,7 @@ def robot_of(name: str, points: str) -> Robot:
     """Return the accurate robot of a study, with small elements at these points of its fingers."""
     study = STUDIES[name]
     robot = make_robot(study.robot, mesh="accurate", **study.options)
-    options = {"mesh": "accurate", "self_contact": False}
-    finger = PointFinger(**(options | dict(study.options)))
+    finger = PointFinger(cables=study.options.get("cables", 2), mesh="accurate", self_contact=False)
     finger.points = points
     if study.robot == "finger":
         return finger
