@@ -75,12 +75,13 @@ def standalone_model(robot: Robot, weights: str | Path | None = None, members: i
     Raises:
         WeightsError: also for actuators with a largest effort, which learned models do not know.
     """
+    model = pretrained_model(robot, weights, members)
     if limited := [actuator.name for actuator in robot.actuators if math.isfinite(actuator.max_effort)]:
         raise WeightsError(
             f"robot '{robot.name}': a surrogate drives actuators beyond their max_effort ({', '.join(limited)}); use "
             "backend='fem' or 'hybrid'"
         )
-    return pretrained_model(robot, weights, members)
+    return model
 
 
 def shipped_robots() -> dict[str, tuple[str, dict[str, Any]]]:

@@ -98,7 +98,8 @@ def test_a_box_is_lifted_by_friction_and_falls_when_the_fingers_open():
     rest = backend.state
     weight = 9.81 * 0.020
     np.testing.assert_allclose(rest.effector[0], robot.effector_rest, atol=6e-4)
-    np.testing.assert_allclose(rest.contacts.total, [[0.0, 0.0, weight], [0.0, 0.0, 0.0]], atol=1e-6)
+    # The solver stops within 1e-10 m, and the box stands on the table with a stiffness of 1.7e5 N/m.
+    np.testing.assert_allclose(rest.contacts.total, [[0.0, 0.0, weight], [0.0, 0.0, 0.0]], atol=1e-5)
     state = grip_and_lift(backend, np.radians(26.0), 0.010)
     assert state.effector[0, 2] - rest.effector[0, 2] > 0.009
     np.testing.assert_allclose(state.contacts.total, [[0.0, 0.0, 0.0], [0.0, 0.0, -weight]], atol=2e-3)
