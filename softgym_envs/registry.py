@@ -97,7 +97,11 @@ class Registry(Mapping[str, type]):
         """
         if not isinstance(name_or_class, str | type):
             made = name_or_class
-            self._check_object(made)
+            if not isinstance(made, self._base_class()):
+                raise ValueError(
+                    f"a {self.kind} must be a registered name, 'module:class', a subclass of "
+                    f"{self._base.replace(':', '.')} or an object of one, got {made!r}"
+                )
             if options:
                 raise ValueError(
                     f"{self.kind} '{_shown(type(made))}' is already an object: it cannot take {', '.join(options)}"
@@ -146,20 +150,14 @@ class Registry(Mapping[str, type]):
                     stacklevel=3,
                 )
 
-    def _checked(self, cls: object) -> type:
+    def _base_class(self) -> type:
         module, _, name = self._base.partition(":")
-        base = getattr(import_module(module), name)
-        if not (isinstance(cls, type) and issubclass(cls, base)):
-            raise ValueError(f"a {self.kind} must be a subclass of {module}.{name}, got {cls!r}")
-        return cls
+        return getattr(import_module(module), name)
 
-    def _check_object(self, made: object) -> None:
-        module, _, name = self._base.partition(":")
-        if not isinstance(made, getattr(import_module(module), name)):
-            raise ValueError(
-                f"a {self.kind} must be a registered name, 'module:class', a subclass of {module}.{name} "
-                f"or an object of one, got {made!r}"
-            )
+    def _checked(self, cls: object) -> type:
+        if not (isinstance(cls, type) and issubclass(cls, self._base_class())):
+            raise ValueError(f"a {self.kind} must be a subclass of {self._base.replace(':', '.')}, got {cls!r}")
+        return cls
 
     def _name_of(self, cls: type, name: str) -> str:
         """Return the name to register a class under, and assign it to a class without a name."""

@@ -134,7 +134,7 @@ MISTAKES = {
     ),
     "pulls in millimetres": (
         lambda _: make_backend("surrogate", make_robot("finger")).step([4.0, 1.0]),
-        "command = 4 m of actuator 'cable_1' is far beyond its range; allowed: 0 to 0.02 m",
+        "command = 4 m of actuator 'cable_1' is far beyond its range of 0 to 0.02 m; check its unit",
     ),
     "one of several bodies in millimetres": (
         lambda _: gymnasium.make_vec(REACH, num_envs=2).reset(options={"design": [{}, {"length": 40.0}]}),

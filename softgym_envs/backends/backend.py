@@ -15,7 +15,7 @@ from softgym_envs.mechanics.contact.contact import Contacts
 from softgym_envs.mechanics.solvers.dynamics import Motion
 from softgym_envs.robots.base import Robot
 
-#: Displacements beyond this many times the range of their actuator are taken for a mistake in the unit.
+#: A displacement this many times as large as the bounds of its actuator is taken for a mistake in its unit.
 FAR_BEYOND = 10.0
 
 
@@ -147,15 +147,15 @@ def check_command(robot: Robot, command: object, mode: str) -> np.ndarray:
     """Return a command as an array (n_a,).
 
     Raises:
-        ValueError: unless it is finite numbers, one for each actuator; or for a displacement so far beyond the range of
+        ValueError: unless it is one finite number for each actuator; also for a displacement so far beyond the range of
             its actuator that its unit is probably wrong.
     """
     array = check_numbers("command", command, len(robot.actuators))
     for actuator, value in zip(robot.actuators, array.tolist(), strict=True):
         if mode == "displacement" and abs(value) > FAR_BEYOND * max(abs(actuator.low), abs(actuator.high)):
             raise ValueError(
-                f"command = {value:g} {actuator.unit} of actuator '{actuator.name}' is far beyond its range; "
-                f"allowed: {actuator.low:g} to {actuator.high:g} {actuator.unit}"
+                f"command = {value:g} {actuator.unit} of actuator '{actuator.name}' is far beyond its range of "
+                f"{actuator.low:g} to {actuator.high:g} {actuator.unit}; check its unit"
             )
     return array
 
