@@ -24,20 +24,38 @@ from softgym_envs.surrogate.features import Features
 
 
 @njit(cache=True, error_model="numpy")
+def _positive_pivots(a):
+    """Return whether a symmetric matrix (n, n), which is overwritten, is positive definite."""
+    n = len(a)
+    for k in range(n):
+        if not a[k, k] > 0.0:
+            return False
+        for i in range(k + 1, n):
+            factor = a[i, k] / a[k, k]
+            for j in range(k + 1, n):
+                a[i, j] -= factor * a[k, j]
+    return True
+
+
+@njit(cache=True, error_model="numpy")
 def definite(matrices):
     """Return whether symmetric matrices (B, n, n) are positive definite, shape (B,): all pivots are positive."""
-    found = np.ones(len(matrices), dtype=np.bool_)
-    n = matrices.shape[1]
+    found = np.empty(len(matrices), dtype=np.bool_)
     for row in range(len(matrices)):
-        a = matrices[row].copy()
-        for k in range(n):
-            if not a[k, k] > 0.0:
-                found[row] = False
-                break
-            for i in range(k + 1, n):
-                factor = a[i, k] / a[k, k]
-                for j in range(k + 1, n):
-                    a[i, j] -= factor * a[k, j]
+        found[row] = _positive_pivots(matrices[row].copy())
+    return found
+
+
+@njit(cache=True, error_model="numpy")
+def softer(factor, stiffness, unmoved, slot):
+    """Return which stiffnesses (B, n, n) are more than ``factor`` times softer than those of their bodies, shape (B,).
+
+    Those of the bodies, ``unmoved`` (S, n, n), are at displacement zero; ``slot`` (B,) is the body of each row. A body
+    is softer if it is so in any direction: ``factor * stiffness - unmoved`` is then not positive definite.
+    """
+    found = np.empty(len(stiffness), dtype=np.bool_)
+    for row in range(len(stiffness)):
+        found[row] = not _positive_pivots(factor * stiffness[row] - unmoved[slot[row]])
     return found
 
 
@@ -283,10 +301,11 @@ class SurrogateModel(ABC):
         scale *= floor ** (1.0 - power)
         scales, soft, arrays = np.array([scale]), None, context.arrays
         if domain.limits_growth:
-            unmoved, K = arrays["unmoved"][context.slot], self._curvature(context, displacement)
-            soft = ~definite(domain.growth * K - unmoved)
-            if calibration.buckling != 1.0:
-                near = ~definite(calibration.soft * K - unmoved)
+            bodies, K = (arrays["unmoved"], context.slot), self._curvature(context, displacement)
+            soft = softer(domain.growth, K, *bodies)
+            # What is not softer than the smaller factor is not softer than the larger one either.
+            if calibration.buckling != 1.0 and (soft.any() or calibration.soft < domain.growth):
+                near = softer(calibration.soft, K, *bodies)
                 scales = np.where(near, scale * calibration.buckling, scale)
         uncertainty, doubt = np.empty(len(displacement)), np.empty(len(displacement), dtype=np.int8)
         judge(

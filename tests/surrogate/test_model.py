@@ -16,7 +16,7 @@ from softgym_envs.surrogate import online
 from softgym_envs.surrogate.baselines import residual
 from softgym_envs.surrogate.correction import fit_correction
 from softgym_envs.surrogate.data.dataset import load_dataset
-from softgym_envs.surrogate.model import Context, SurrogateModel, definite
+from softgym_envs.surrogate.model import Context, SurrogateModel, definite, softer
 from softgym_envs.surrogate.networks import NETWORKS
 from softgym_envs.surrogate.potential import kernels
 from softgym_envs.surrogate.potential.model import Model
@@ -187,6 +187,22 @@ def test_definite_matrices_are_recognised_in_any_units():
     broken = sound - 2.0 * np.linalg.eigvalsh(sound)[:, 0, None, None] * np.eye(9)
     for matrices, expected in ((sound, True), (broken, False)):
         assert (definite(matrices * units[:, None] * units) == expected).all()
+
+
+@pytest.mark.parametrize("factor", [1.2, 2.0, 4.0])
+def test_softer_states_are_those_whose_compliance_grew_by_more_than_the_factor(factor):
+    rng = np.random.default_rng(6)
+    roots = rng.normal(size=(40, 3, 3))
+    unmoved = roots[:5] @ roots[:5].swapaxes(1, 2)
+    slot = rng.integers(5, size=40)
+    stiffness = unmoved[slot] * rng.uniform(0.1, 1.5, (40, 1, 1)) + 0.01 * roots @ roots.swapaxes(1, 2)
+    growth = np.array(
+        [max(np.linalg.eigvals(np.linalg.solve(K, unmoved[s])).real) for K, s in zip(stiffness, slot, strict=True)]
+    )
+    found = softer(factor, stiffness, unmoved, slot)
+    assert 0 < found.sum() < 40
+    assert (found == (growth > factor)).all()
+    assert softer(factor, np.full((1, 3, 3), np.nan), unmoved, slot[:1]).all()  # what is not known counts as soft
 
 
 def test_a_row_without_a_definite_compliance_does_not_affect_others(monkeypatch):
