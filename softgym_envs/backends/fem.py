@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.beam_motion import BeamMotion
 from softgym_envs.mechanics.solvers.dynamics import Dynamics, Motion
 from softgym_envs.mechanics.solvers.equilibrium import SATURATED, Equilibrium
-from softgym_envs.mechanics.solvers.exact_compliance import condensed_at
+from softgym_envs.mechanics.solvers.exact_compliance import exact_at
 from softgym_envs.mechanics.solvers.learned_errors import possible_errors
 from softgym_envs.mechanics.solvers.schemes import SCHEMES
 from softgym_envs.mechanics.solvers.statics import Statics
@@ -372,7 +371,7 @@ class FEMBackend(Backend):
             effort=equilibrium.effort[slices["a"]],
             effector=effector,
             slack=equilibrium.slack,
-            condensed=condensed if exact else partial(condensed_at, self._statics, equilibrium),
+            condensed=condensed if exact else lambda statics=self._statics: exact_at(statics, equilibrium).condensed,
             nodes=equilibrium.x,
             velocity=velocity,
             motion=motion,
