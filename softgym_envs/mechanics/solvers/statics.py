@@ -236,8 +236,8 @@ class Statics:
                 if length < 1e-3:
                     raise NewtonFailure
             self.x, self.effort = x, effort
-            near = iteration > 1 and length == 1.0 and linear.positive_definite  # to the last factorisation
-            if near and remaining <= self.tolerance and not self.exact_compliance:
+            near = iteration > 1 and length == 1.0 and remaining <= self.tolerance  # to the last factorisation
+            if near and not self.exact_compliance and linear.positive_definite:
                 linear.follow(assembled)
                 return iteration
             if not linear.factorise(assembled, x, definite=definite):
