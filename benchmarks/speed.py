@@ -212,9 +212,10 @@ def fem_speed() -> dict[str, object]:
 def notched_beam() -> dict[str, object]:
     """CPU time of the notched reference beam for a 10 mm pull, in one increment and through the levels of SOFA.
 
-    SOFA's published times are those of its steps to 1e-6 mm through the same seven levels on the same mesh, without the
-    exact tangent: 91 steps of 4.8 ms with rotations from the elements' edges (``large``, another energy), 207 of 3.1 ms
-    with those of the polar decomposition (``fast_polar``, the same energy).
+    Each with ``W`` at every equilibrium, and without. SOFA's published times are those of its steps to 1e-6 mm through
+    the same seven levels on the same mesh, without ``W`` and the exact tangent: 91 steps of 4.8 ms with rotations from
+    the elements' edges (``large``, another energy), 207 of 3.1 ms with those of the polar decomposition
+    (``fast_polar``, the same energy).
     """
     from softgym_envs.mechanics.model import MechanicalModel
     from softgym_envs.mechanics.solvers.statics import Statics
@@ -224,10 +225,9 @@ def notched_beam() -> dict[str, object]:
         data["nodes"] * 1e-3, data["tets"], fixed=data["fixed"], young_modulus=3e6, poisson_ratio=0.3
     )
     model.add_cable("cable", data["cable_points"] * 1e-3, data["pull_point"] * 1e-3, unilateral=False)
-    statics = Statics(model)
 
-    def milliseconds(levels: tuple[float, ...]) -> float:
-        times = []
+    def milliseconds(levels: tuple[float, ...], *, with_compliance: bool = True) -> float:
+        statics, times = Statics(model, exact_compliance=with_compliance), []
         for _ in range(22):
             start = time.process_time()
             statics.reset()
@@ -236,9 +236,12 @@ def notched_beam() -> dict[str, object]:
             times.append(time.process_time() - start)
         return 1e3 * statistics.median(times[1:])
 
+    path = (0.0, 0.001, 0.002, 0.004, 0.006, 0.008, 0.01)
     return {
         "one increment [ms]": milliseconds((0.01,)),
-        "seven levels [ms]": milliseconds((0.0, 0.001, 0.002, 0.004, 0.006, 0.008, 0.01)),
+        "seven levels [ms]": milliseconds(path),
+        "one increment, without W [ms]": milliseconds((0.01,), with_compliance=False),
+        "seven levels, without W [ms]": milliseconds(path, with_compliance=False),
         "seven levels with SOFA v25.06, other rotations [ms]": 440.0,
         "seven levels with SOFA v25.06, same energy [ms]": 640.0,
     }

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.beam_motion import BeamMotion
 from softgym_envs.mechanics.solvers.dynamics import Dynamics, Motion
 from softgym_envs.mechanics.solvers.equilibrium import SATURATED, Equilibrium
-from softgym_envs.mechanics.solvers.exact_compliance import condensed_at
+from softgym_envs.mechanics.solvers.exact_compliance import exact_at
 from softgym_envs.mechanics.solvers.learned_errors import possible_errors
 from softgym_envs.mechanics.solvers.schemes import SCHEMES
 from softgym_envs.mechanics.solvers.statics import Statics
@@ -348,8 +347,8 @@ class FEMBackend(Backend):
     def _state(
         self, equilibrium: Equilibrium, command: np.ndarray, motion: Motion | None = None, *, still: bool = False
     ) -> State:
-        condensed, slices = equilibrium.condensed, equilibrium.condensed.slices
-        exact = motion is not None or self._statics.exact_compliance
+        condensed, slices, statics = equilibrium.condensed, equilibrium.condensed.slices, self._statics
+        exact = motion is not None or statics.exact_compliance
         effector = equilibrium.delta[slices["e"]].reshape(-1, 3)
         velocity = np.zeros_like(effector)
         if motion is not None and not still:
@@ -364,7 +363,7 @@ class FEMBackend(Backend):
             doubt |= SOFT
         if motion is None and learned:
             held = np.abs(equilibrium.effort[slices["a"]]) < self.largest_efforts * SATURATED
-            uncertainty = float(np.linalg.norm(possible_errors(self._statics, held)[:3]))
+            uncertainty = float(np.linalg.norm(possible_errors(statics, held)[:3]))
             doubt |= SPREAD if uncertainty > self.robot.goal_tolerance else 0
         return State(
             command=np.array(command, dtype=float),
@@ -372,7 +371,7 @@ class FEMBackend(Backend):
             effort=equilibrium.effort[slices["a"]],
             effector=effector,
             slack=equilibrium.slack,
-            condensed=condensed if exact else partial(condensed_at, self._statics, equilibrium),
+            condensed=condensed if exact else (lambda: exact_at(statics, equilibrium).condensed),
             nodes=equilibrium.x,
             velocity=velocity,
             motion=motion,

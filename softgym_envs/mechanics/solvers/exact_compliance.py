@@ -1,18 +1,19 @@
-"""Condensed models of equilibria that were found without computing an exact ``W``."""
+"""Condensed models and stability of equilibria that were found without a factorisation there."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
 from softgym_envs.errors import ConvergenceError
-from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.solvers.equilibrium import Equilibrium, RowLayout
 from softgym_envs.mechanics.solvers.linearisation import Linearisation
 from softgym_envs.mechanics.solvers.statics import Statics
 
 
-def condensed_at(statics: Statics, found: Equilibrium) -> CondensedModel:
-    """Return the condensed model at an equilibrium that a solver has found, with an exact ``W``.
+def exact_at(statics: Statics, found: Equilibrium) -> Equilibrium:
+    """Return an equilibrium that a solver has found, with ``W`` and ``stable`` of the tangent there.
 
     The solver stays where it is. If that is the equilibrium, its next step starts with this factorisation.
 
@@ -29,4 +30,5 @@ def condensed_at(statics: Statics, found: Equilibrium) -> CondensedModel:
         raise ConvergenceError("the tangent of the equilibrium is singular", fraction=1.0)
     values = found.x, found.effort, linear.delta, linear.W, found.slack
     layout = RowLayout.of(statics.model)
-    return layout.equilibrium(*values, stable=linear.positive_definite, iterations=0).condensed
+    stable = linear.positive_definite
+    return replace(found, condensed=layout.equilibrium(*values, stable=stable, iterations=0).condensed, stable=stable)

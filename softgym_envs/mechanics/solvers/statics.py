@@ -55,8 +55,8 @@ class Statics:
         tolerance: largest remaining correction of any node at convergence [m].
         max_iterations: limit of Newton iterations per load increment.
         max_halvings: the smallest load increment is ``0.5 ** max_halvings`` of the whole step.
-        exact_compliance: compute ``W`` at each equilibrium. Otherwise, with contact, it may be that of the last
-            iterate, which saves a factorisation; without friction, `exact_compliance.condensed_at` computes it later.
+        exact_compliance: compute ``W`` and stability at each equilibrium. Otherwise they may be those of the last
+            iterate, which saves a factorisation; without friction, `exact_compliance.exact_at` computes them later.
         compiled: solve bodies of beams in compiled code (`BeamMotion`) where that converges fast; it gives the same
             equilibria to the tolerance.
 
@@ -236,6 +236,10 @@ class Statics:
                 if length < 1e-3:
                     raise NewtonFailure
             self.x, self.effort = x, effort
+            near = iteration > 1 and length == 1.0 and remaining <= self.tolerance  # to the last factorisation
+            if near and not self.exact_compliance and linear.positive_definite:
+                linear.follow(assembled)
+                return iteration
             if not linear.factorise(assembled, x, definite=definite):
                 raise NewtonFailure
             step_q, step_effort = self._correction(None, linear.delta, effort, target, driven)
@@ -472,8 +476,7 @@ class Statics:
             raise ValueError(
                 f"the model's constraints changed after this {type(self).__name__} was made; make a new one"
             )
-        balanced = self._balance(goal, driven)
-        if balanced is not None:
+        if (balanced := self._balance(goal, driven)) is not None:
             return balanced
         linear = self.linearisation
         if self._elasticity_version != self.model.elasticity_version:

@@ -1,0 +1,100 @@
+"""Equilibria found without a factorisation there: W and stability are computed later, and are the same."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from softgym_envs import make_robot
+from softgym_envs.mechanics.solvers.exact_compliance import exact_at
+from softgym_envs.mechanics.solvers.linearisation import Linearisation
+from softgym_envs.mechanics.solvers.statics import Statics
+
+BUCKLING = {"length": 0.0398, "height": 0.0214, "joint_height": 0.0052, "poisson_ratio": 0.307, "bar_length": 0.051}
+"""A gripper that its taut cables hold where it would buckle under their tensions, beyond 0.93 of these pulls:"""
+PULLS = np.array([0.016, 0.0025, 0.0195, 0.004]) * np.linspace(0.3, 1.0, 15)[:, None]
+
+
+@pytest.fixture(scope="module")
+def finger():
+    """A finger and its commands: random, with steps of up to 1 mm."""
+    commands = 5e-3 + np.cumsum(np.random.default_rng(0).uniform(-1e-3, 1e-3, (12, 2)), axis=0)
+    return make_robot("finger").build(), commands
+
+
+@pytest.fixture
+def factorised(monkeypatch):
+    """A list that grows with every factorisation of a tangent."""
+    calls, factorise = [], Linearisation.factorise
+    monkeypatch.setattr(
+        Linearisation, "factorise", lambda *args, **options: calls.append(1) or factorise(*args, **options)
+    )
+    return calls
+
+
+def agree(found, expected):
+    """Assert that two equilibria are the same, with the same condensed model."""
+    np.testing.assert_allclose(found.x, expected.x, rtol=0, atol=1e-10)
+    for name in ("compliance", "effort"):
+        value, known = (getattr(state.condensed, name) for state in (found, expected))
+        np.testing.assert_allclose(value, known, rtol=0, atol=1e-8 * np.abs(known).max())
+    np.testing.assert_allclose(found.condensed.delta.array, expected.condensed.delta.array, rtol=0, atol=1e-10)
+    np.testing.assert_array_equal(found.slack, expected.slack)
+    assert found.stable == expected.stable
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_the_compliance_computed_later_is_that_of_the_state(finger, late):
+    model, commands = finger
+    exact, near = Statics(model, tolerance=1e-12), Statics(model, tolerance=1e-12, exact_compliance=False)
+    expected, found, read = [], [], []
+    for command in commands:
+        expected.append(exact.solve(command))
+        found.append(near.solve(command))
+        if not late:
+            read.append(exact_at(near, found[-1]))
+    read = read or [exact_at(near, state) for state in found]
+    for state, known in zip(read, expected, strict=True):
+        agree(state, known)
+    before, after = (np.array([state.condensed.compliance for state in states]) for states in (found, read))
+    assert (before != after).any()  # it was that of the last iterate
+    agree(exact_at(near, near.solve(commands[0])), exact.solve(commands[0]))  # nothing has moved the solver
+
+
+def test_a_step_takes_one_factorisation_unless_its_compliance_is_computed(finger, factorised):
+    model, commands = finger
+
+    def factorisations(exact, reads):
+        statics = Statics(model, exact_compliance=exact)
+        statics.solve([0.0, 0.0])
+        factorised.clear()
+        for command in commands:
+            state = statics.solve(command)
+            if reads:
+                exact_at(statics, state)
+        return len(factorised) / len(commands)
+
+    eager, lazy, read = (factorisations(*case) for case in ((True, False), (False, False), (False, True)))
+    print(f"factorisations per step: {eager:.2f}, without W {lazy:.2f}, with W computed after each step {read:.2f}")
+    assert lazy <= 1.25 and read <= eager + 0.1 and eager >= 1.75
+
+
+def test_the_next_step_starts_with_the_factorisation_of_the_compliance(finger):
+    model, commands = finger
+    statics = Statics(model, exact_compliance=False)
+    for command in commands[:3]:
+        found = statics.solve(command)
+    assert (statics.linearisation.W == found.condensed.compliance).all()
+    exact = exact_at(statics, found).condensed.compliance
+    assert (statics.linearisation.W == exact).all() and (exact != found.condensed.compliance).any()
+
+
+def test_stability_computed_later_is_that_of_the_state():
+    model, flags = make_robot("two_finger_gripper").build(BUCKLING), []
+    exact, near = Statics(model), Statics(model, exact_compliance=False)
+    for pull in PULLS:
+        expected, found = exact.solve(pull), near.solve(pull)
+        np.testing.assert_allclose(found.x, expected.x, rtol=0, atol=5e-10)
+        assert exact_at(near, found).stable == expected.stable
+        flags.append(expected.stable)
+    assert flags[0] and not flags[-1]
