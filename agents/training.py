@@ -20,6 +20,7 @@ from softgym_envs.config import difference, load_stored, provenance, save_config
 from softgym_envs.errors import DataError, WeightsError
 from softgym_envs.extras import require
 from softgym_envs.storage import atomic_write, read_json, write_json
+from softgym_envs.wording import counted
 
 if TYPE_CHECKING:
     from stable_baselines3 import SAC
@@ -156,20 +157,20 @@ def _earlier_steps(config: TrainConfig, folder: Path) -> int | None:
     finished = _finished_steps(folder)
     if config.steps < finished:
         raise DataError(
-            f"'{folder}' holds a finished training of {finished} steps, got steps = {config.steps}; choose a new "
-            f"folder, or steps = {finished} or more"
+            f"'{folder}' holds a finished training of {counted(finished, 'step')}, got steps = {config.steps}; choose "
+            f"a new folder, or steps = {finished} or more"
         )
     path = folder / CHECKPOINT
     made = _meta(path)["curve"][-1]["step"] if finished < config.steps < stored.steps and path.exists() else 0
     if config.steps < made:
         raise DataError(
-            f"'{folder}' holds a training that has made {made} of {stored.steps} steps, got steps = {config.steps}; "
-            f"choose a new folder, or steps = {made} or more"
+            f"'{folder}' holds a training that has made {made} of {counted(stored.steps, 'step')}, got "
+            f"steps = {config.steps}; choose a new folder, or steps = {made} or more"
         )
     if 0 < finished < config.steps and not path.exists():
         raise DataError(
-            f"'{folder}' holds a finished training of {finished} steps without '{CHECKPOINT}', so it cannot be "
-            f"extended to {config.steps}; choose a new folder, and start from this policy with --initial "
+            f"'{folder}' holds a finished training of {counted(finished, 'step')} without '{CHECKPOINT}', so it cannot "
+            f"be extended to {config.steps}; choose a new folder, and start from this policy with --initial "
             f"{folder / POLICY}"
         )
     return stored.steps

@@ -20,6 +20,7 @@ from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.config import load_config
 from softgym_envs.errors import DataError
 from softgym_envs.storage import write_json
+from softgym_envs.wording import decimal
 
 RECORDED = SOURCES[0]
 
@@ -165,7 +166,9 @@ def main(folders: Sequence[str]) -> None:
         except DataError as error:
             raise SystemExit(f"nothing recorded: {error}") from None
         kept[name] = entry
-        print(f"{name}: {entry['rows'][0]['baseline [mm]']:.2f} -> {entry['rows'][0]['winner [mm]']:.2f} mm")
+        print(
+            f"{name}: {' -> '.join(decimal(entry['rows'][0][f'{who} [mm]'], 2) for who in ('baseline', 'winner'))} mm"
+        )
     recorded["codesign"]["results"] = {name: kept[name] for name in (*TITLES, *kept) if name in kept}
     write_json(RECORDED, recorded)
 

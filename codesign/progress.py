@@ -10,6 +10,7 @@ from softgym_envs.codesign.folder import StudyFolder
 from softgym_envs.codesign.records import REFINED, FinalistTest, TestGroup, TrialResult
 from softgym_envs.codesign.report.results import Comparison, StudyResults
 from softgym_envs.codesign.report.units import present
+from softgym_envs.wording import counted
 
 PHYSICS = {REFINED: "fem with a finer mesh"}
 """Names of physics whose key does not say what they are."""
@@ -135,7 +136,7 @@ class Progress:
                 continue
             self._done += 1
             seed = f" (seed {test.seed})" if test.seed else ""
-            which = f"{test.agent}{seed} on {PHYSICS.get(test.backend, test.backend)}, {test.goals} goals"
+            which = f"{test.agent}{seed} on {PHYSICS.get(test.backend, test.backend)}, {counted(test.goals, 'goal')}"
             self.say(f"{self._countdown.text(self._done)} test of trial {test.trial}, {which}: {self._test_text(test)}")
 
     def _test_text(self, test: FinalistTest) -> str:
@@ -191,6 +192,6 @@ class Progress:
             low, high = sorted(row.distance_mesh.interval)
             interval += f", with the error of the mesh {measure.number(low, '+')} to {measure.text(high, '+')}"
         return (
-            f"{row.agent} on {PHYSICS.get(row.backend, row.backend)}, {row.goals} test goals: {', '.join(changes)} "
-            f"(change {measure.text(row.distance_change, '+')}{interval})"
+            f"{row.agent} on {PHYSICS.get(row.backend, row.backend)}, {counted(row.goals, 'test goal')}: "
+            f"{', '.join(changes)} (change {measure.text(row.distance_change, '+')}{interval})"
         )

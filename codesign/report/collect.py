@@ -31,6 +31,7 @@ from softgym_envs.codesign.report.statistics import (
 )
 from softgym_envs.codesign.snapshot import StudySnapshot
 from softgym_envs.config import provenance
+from softgym_envs.wording import counted
 
 FEW_GOALS = 10
 """With fewer test goals a difference may well be chance."""
@@ -57,7 +58,7 @@ def collect(snapshot: StudySnapshot) -> StudyResults:
         baseline=baseline,
         winner=winner,
         no_winner=snapshot.verdict.reason,
-        few_goals=f"Only {few} test goals: the difference may be chance." if few < FEW_GOALS else "",
+        few_goals=f"Only {counted(few, 'test goal')}: the difference may be chance." if few < FEW_GOALS else "",
         comparison=comparison,
         pareto=snapshot.pareto if config.secondary_objectives else [],
         transfer=[

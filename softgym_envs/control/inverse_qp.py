@@ -9,6 +9,7 @@ import numpy as np
 
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
+from softgym_envs.wording import counted
 
 if TYPE_CHECKING:
     from softgym_envs.robots.base import Robot
@@ -163,7 +164,9 @@ class InverseQP:
             (self.min_effort, self.max_effort, "effort"),
         ):
             if low.shape != (count,) or high.shape != (count,) or not (low <= high).all():
-                raise ValueError(f"bounds of {word} must be {count} pairs, low <= high, got {low} and {high}")
+                raise ValueError(
+                    f"bounds of {word} must be {counted(count, 'pair')}, low <= high, got {low} and {high}"
+                )
         self._proxqp = proxqp
         self._qp: Any = None
         self._rows: list[Any] = []  # the solvers of `solve_batch`
@@ -239,15 +242,16 @@ class InverseQP:
         command = np.asarray(command, dtype=float)
         delta, effort = condensed.delta, condensed.lambda_.a
         if goal.shape != delta.e.shape or not np.isfinite(goal).all():
-            raise ValueError(f"goal must be {delta.e.size} finite coordinates, got {goal.tolist()}")
+            raise ValueError(f"goal must be {counted(delta.e.size, 'finite coordinate')}, got {goal.tolist()}")
         if command.shape != self.rates.shape or effort.shape != self.rates.shape or not np.isfinite(command).all():
             raise ValueError(
-                f"command must be {len(self.rates)} finite numbers, got {command.tolist()} for {len(effort)} actuators"
+                f"command must be {counted(len(self.rates), 'finite number')}, got {command.tolist()} for "
+                f"{counted(len(effort), 'actuator')}"
             )
         if not (np.isfinite(condensed.compliance).all() and np.isfinite(delta.array).all()):
             raise ValueError("the condensed model contains values that are not finite")
         if self.goal_weights is not None and self.goal_weights.shape != goal.shape:
-            raise ValueError(f"goal_weights must be {goal.size} numbers, got {self.goal_weights.tolist()}")
+            raise ValueError(f"goal_weights must be {counted(goal.size, 'number')}, got {self.goal_weights.tolist()}")
         return goal, command
 
     def limits(

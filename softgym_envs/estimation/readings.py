@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from softgym_envs.wording import counted
+
 MOST_GROWTH = 10.0
 """Largest volume of a cavity that a reading may tell, in volumes at rest; also largest pressure of its air over that at
 rest. Neither occurs in a soft body, but both do in readings of a wrong unit."""
@@ -70,7 +72,7 @@ def checked_readings(name: str, values: np.ndarray | None, count: int) -> np.nda
     """Return values of one kind of reading as an array (count,), or a ValueError."""
     array = np.asarray([] if values is None else values, dtype=float)
     if array.shape != (count,) or not np.isfinite(array).all():
-        raise ValueError(f"readings '{name}' must be {count} finite values, got {array.tolist()}")
+        raise ValueError(f"readings '{name}' must be {counted(count, 'finite value')}, got {array.tolist()}")
     return array
 
 
