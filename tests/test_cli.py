@@ -65,6 +65,20 @@ def test_a_rollout_says_what_is_not_trusted_and_shows_forces_in_percent(softgym)
     assert status == 0 and "trusted" not in out and re.search(r"final error 0\.\d+ %, success True", out)
 
 
+def test_evaluate_draws_the_bodies_of_a_configuration_that_samples_them(softgym):
+    command = ("evaluate", "--config", "finger_reach_designs", "--agent", "qp", "--goals", 2)
+    status, out, err = softgym(*command, "--json")
+    table = json.loads(out)
+    assert status == 0 and [row["bodies"] for row in table["results"]] == ["drawn", "own"]
+    first, second = table["drawn_designs"]
+    assert {name for name in first if first[name] != second[name]} == {"length", "height", "joint_height"}
+    assert re.search(
+        r"2 drawn bodies, one for each goal \(seed 2000003\):\nqp .*\nthe environment's own body:\nqp ", err
+    )
+    status, out, err = softgym(*command, "--json", "--design", "length=0.041")
+    assert [row["bodies"] for row in json.loads(out)["results"]] == ["one"] and "drawn" not in err
+
+
 def test_results_as_json(softgym, tmp_path):
     status, out, _ = softgym("list", "--json")
     tables = json.loads(out)
