@@ -16,7 +16,14 @@ from softgym_envs.agents.evaluation import Evaluation, evaluate, evaluation_set
 from softgym_envs.agents.learners import make_learner
 from softgym_envs.agents.learners.base import Learner, Tensors
 from softgym_envs.agents.policy import Policy, read_tensors, save_policy
-from softgym_envs.config import difference, load_stored, provenance, save_config, save_resolved
+from softgym_envs.config import (
+    continue_with_code,
+    difference,
+    load_stored,
+    provenance,
+    save_config,
+    save_resolved,
+)
 from softgym_envs.errors import DataError, WeightsError
 from softgym_envs.extras import require
 from softgym_envs.storage import atomic_write, read_json, write_json
@@ -72,7 +79,8 @@ def train(
     A folder with a checkpoint is extended by the same configuration with more ``steps``; a training that has not ended
     may also be shortened, to any number of steps from where it stands. What a learner plans over all steps, such as its
     learning rate, is from then on that of a training of the new number of steps. Until the training ends, the folder
-    keeps the previous policy, if there is one. ``provenance.json`` and the card list each change of the steps.
+    keeps the previous policy, if there is one. ``provenance.json`` and the card list each change of the steps, and
+    other code (commit or versions) than began the training.
 
     Args:
         config: configuration of the training.
@@ -112,6 +120,9 @@ def train(
         save_resolved(folder, config)
     elif earlier != config.steps:
         _save_extension(folder, config, earlier, run.learner.step)
+    change = continue_with_code(folder) if earlier is not None and run.learner.step else ""
+    if change and progress:
+        tqdm.write(f"warning: training '{folder}' was {change}; what they compute may differ")
     run.learner.log_to(folder)
 
     def stop() -> bool:
@@ -284,8 +295,8 @@ class _Run:
             "curve": self._curve,
             "provenance": provenance(),
         }
-        if extensions := read_json(self._folder / "provenance.json").get("extensions"):
-            card["extensions"] = extensions
+        origin = read_json(self._folder / "provenance.json")
+        card |= {key: origin[key] for key in ("extensions", "continued") if key in origin}
         if self._proposer is not None:
             self._proposer.finish(_model(self.learner))
         save_policy(self._folder / POLICY, self._best, card)

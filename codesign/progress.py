@@ -57,6 +57,7 @@ class Progress:
         self.objective = self.config.primary
         self.enabled = enabled
         self._seen: set[Path] = set()
+        self._warned: set[str] = set()
         self._best: TrialResult | None = None
         config = study.config
         phases = {
@@ -86,6 +87,12 @@ class Progress:
         """Print a line."""
         if self.enabled:
             print(line, flush=True)
+
+    def warn(self, text: str) -> None:
+        """Print a warning, once."""
+        if text not in self._warned:
+            self._warned.add(text)
+            self.say(f"warning: {text}")
 
     def _fresh(self, pattern: str) -> list[Path]:
         """Return files that appeared since the last call, in the order in which they were written."""

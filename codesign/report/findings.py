@@ -33,10 +33,12 @@ class Finding:
 
 
 def findings(snapshot: StudySnapshot, results: StudyResults) -> list[Finding]:
-    """Return the findings of a study, the most important ones first; none without a winner."""
+    """Return the findings of a study, the most important ones first; without a winner only that its code changed."""
     if results.winner is None:
-        return []
+        found = [_code(results)]
+        return [finding for finding in found if finding is not None]
     found = [
+        _code(results),
         _goals(snapshot, results),
         _mesh(snapshot, results),
         _failures(snapshot),
@@ -47,6 +49,18 @@ def findings(snapshot: StudySnapshot, results: StudyResults) -> list[Finding]:
     if results.few_goals:
         found.append(Finding("Few test goals", f"{results.few_goals} Raise goals.unseen_count."))
     return [finding for finding in found if finding is not None]
+
+
+def _code(results: StudyResults) -> Finding | None:
+    """Return whether the results come from more than one state of the code."""
+    changes = results.provenance.get("code_changes")
+    if not changes:
+        return None
+    text = ". ".join(f"The study was {change}" for change in changes)
+    return Finding(
+        "The code changed during the study",
+        f"{text}. What they compute may differ; a study in a new folder has one state of the code.",
+    )
 
 
 def _goals(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:
