@@ -168,12 +168,15 @@ class InverseQP:
                     f"bounds of {word} must be {counted(count, 'pair')}, low <= high, got {low} and {high}"
                 )
         self._proxqp = proxqp
+        self._robot: Robot | None = None
         self._qp: Any = None
         self._rows: list[Any] = []  # the solvers of `solve_batch`
 
     @classmethod
     def for_robot(cls, robot: Robot, **options: Any) -> Self:
         """Return the controller of a robot, with the ranges, rates and largest efforts of its actuators.
+
+        It refuses goals that are far from the robot, such as those in millimetres.
 
         Args:
             robot: the robot. The goal weights of a robot with one effector are its goal axes.
@@ -189,7 +192,9 @@ class InverseQP:
             "max_effort": largest,
             "goal_weights": None if len(robot.effectors) > 1 or np.all(robot.goal_axes) else robot.goal_axes,
         }
-        return cls(**{**arguments, **options})
+        made = cls(**{**arguments, **options})
+        made._robot = robot
+        return made
 
     @classmethod
     def by_efforts(cls, robot: Robot, largest: float, rate: float, **options: Any) -> Self:
@@ -252,7 +257,16 @@ class InverseQP:
             raise ValueError("the condensed model contains values that are not finite")
         if self.goal_weights is not None and self.goal_weights.shape != goal.shape:
             raise ValueError(f"goal_weights must be {counted(goal.size, 'number')}, got {self.goal_weights.tolist()}")
+        self._check_near(goal)
         return goal, command
+
+    def _check_near(self, goals: np.ndarray) -> None:
+        """Raise ValueError for goals (..., n_e) far from the robot, in the coordinates that have a weight."""
+        robot = self._robot
+        if robot is not None and goals.shape[-1] == 3 * len(robot.effectors):
+            if self.goal_weights is not None:
+                goals = np.where(self.goal_weights > 0.0, goals, np.tile(robot.effector_rest, len(robot.effectors)))
+            robot.check_point("goal", goals.reshape(-1, 3))
 
     def limits(
         self, condensed: CondensedModel, command: np.ndarray, slack: np.ndarray | None = None, size: float = 1.0
@@ -302,7 +316,8 @@ class InverseQP:
             slack: actuators that are slack, shape (n_a,); default none.
 
         Raises:
-            ValueError: if goal, command or model has a wrong shape or is not finite.
+            ValueError: if goal, command or model has a wrong shape or is not finite, or if the goal is far from the
+                robot of `for_robot`.
             ConvergenceError: if ProxQP does not reach its tolerance, for example because no step within the rates
                 brings an effort back below ``max_effort``.
         """
@@ -328,10 +343,11 @@ class InverseQP:
             slack: actuators that are slack, shape (n, n_a); default none.
 
         Raises:
-            ValueError: if the models or goals are not finite.
+            ValueError: if the models or goals are not finite, or if a goal is far from the robot of `for_robot`.
         """
         if not all(np.isfinite(values).all() for values in (condensed.compliance, condensed.delta.array, goals)):
             raise ValueError("the condensed models or goals contain values that are not finite")
+        self._check_near(goals)
         if len(self._rows) != len(commands):
             self._rows = [None] * len(commands)
         program = self._program(condensed, goals, commands, slack)
