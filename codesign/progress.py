@@ -143,7 +143,7 @@ class Progress:
                 continue
             self._done += 1
             seed = f" (seed {test.seed})" if test.seed else ""
-            which = f"{test.agent}{seed} on {PHYSICS.get(test.backend, test.backend)}, {counted(test.goals, 'goal')}"
+            which = f"{test.agent}{seed} on {PHYSICS.get(test.backend, test.backend)}, {test.goals} goals"
             self.say(f"{self._countdown.text(self._done)} test of trial {test.trial}, {which}: {self._test_text(test)}")
 
     def _test_text(self, test: FinalistTest) -> str:

@@ -44,7 +44,7 @@ def test_phases_counters_and_the_dimensions_of_the_winner(tmp_path, capsys):
     out = capsys.readouterr().out
     assert re.findall(r"^phase (\d) of 2, (\w+): ", out, re.M) == [("1", "trials"), ("2", "test")]
     assert re.findall(r"^\[(\d)/2.*?\] trial ", out, re.M) == ["1", "2"]
-    tests = re.findall(r"^\[(\d)/(\d).*?\] test of trial ", out, re.M)
+    tests = re.findall(r"^\[(\d)/(\d).*?\] test of trial \d, qp on \w+, unseen goals: ", out, re.M)
     assert [done for done, _ in tests] == [str(k + 1) for k in range(len(tests))] and tests[-1][0] == tests[-1][1]
     assert re.search(r"^winner: trial \d", out, re.M)
     assert re.search(r"^  length .* mm \(baseline .* mm\)", out, re.M)
