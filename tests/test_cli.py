@@ -89,6 +89,8 @@ def test_results_as_json(softgym, tmp_path):
     length = next(each for each in robot["design_variables"] if each["name"] == "length")
     assert status == 0 and length["value"] == 0.041 and length["unit"] == "m"
     assert robot["nodes"] > 100 and 0.0 < robot["mass"] < 1.0
+    status, out, _ = softgym("show", "finger", "--design", "length=0.041")
+    assert status == 0 and "  length           0.041      [0.038, 0.042] m " in out
     status, out, err = softgym("evaluate", "--config", "finger_reach", "--agent", "qp", "--goals", 2, "--json")
     table = json.loads(out)
     assert status == 0 and table["goals"] == 2 and table["results"][0]["agent"] == "qp"
