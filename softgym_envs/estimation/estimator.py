@@ -251,7 +251,7 @@ class Estimator:
     Raises:
         DesignError: for a malformed design.
         InfeasibleDesign: if the body cannot exist.
-        ValueError: if a touched point lies outside the body, for a robot without sensors, or for settings out of bounds.
+        ValueError: if a touched point lies outside the body, or for a robot without sensors or settings out of bounds.
     """
 
     def __init__(
@@ -287,9 +287,7 @@ class Estimator:
         n_a = self._counts[0]
         sensors = model.constraints["s"]
         if not sensors and self.noise.effort is None:
-            raise ValueError(
-                f"robot '{self.robot.name}' has no cavities as sensors; measure efforts: Noise(effort=...)"
-            )
+            raise ValueError(f"robot '{self.robot.name}' has no sensors: no cavities and no Noise(effort=...)")
         self.rest_volumes = np.array([c.rest_volume for c in sensors if isinstance(c, Cavity)])
         self._sealed = np.array([isinstance(c, SealedAir) for c in sensors], dtype=bool)
         self._rest = np.zeros(len(sensors))  # readings of the undeformed body; pressures are relative to ambient

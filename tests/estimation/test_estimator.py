@@ -283,7 +283,7 @@ def test_wrong_inputs_name_themselves():
         Estimator(robot, equilibria=0)
     with pytest.raises(ValueError, match="radius = -1.0 must be positive"):
         Estimator(robot, radius=-1.0)
-    with pytest.raises(ValueError, match=r"robot 'finger' has no cavities as sensors; measure efforts: Noise\(effort="):
+    with pytest.raises(ValueError, match=r"robot 'finger' has no sensors: no cavities and no Noise\(effort="):
         Estimator(make_robot("finger"))
     with pytest.raises(ValueError, match="0.02 m away from the plane of the grid"):
         GRID.cell(np.array([0.0, 0.02, -0.016]))
