@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-
 MOST_STEPS = 10_000
 """Largest number of time steps in a control step: more would run for minutes, and a unit is probably wrong."""
 
