@@ -182,6 +182,7 @@ class EmbeddedLoop:
         chosen = np.ones(goal.size, dtype=bool) if weights is None else weights > 0.0
         if closed is not None and measured is not None:
             seen = np.asarray(measured, dtype=float).ravel()
+            self.controller.check_near("measured effector", seen)
             aim = closed.correct(goal, np.where(chosen, seen, goal) if seen.shape == goal.shape else seen)
         try:
             self.command = self.controller.solve(condensed, aim, self.command, slack)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
+from softgym_envs.backends.backend import check_command
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.wording import counted
@@ -241,8 +242,10 @@ class InverseQP:
         """Return goal (n_e,) and command (n_a,) as arrays.
 
         Raises:
-            ValueError: if goal, command or model has a wrong shape or is not finite.
+            ValueError: if goal, command or model has a wrong shape or is not finite, or if goal or command are far
+                beyond what the robot of `for_robot` can do.
         """
+        count = len(self.rates)
         goal = np.asarray(goal, dtype=float).ravel()
         command = np.asarray(command, dtype=float)
         delta, effort = condensed.delta, condensed.lambda_.a
@@ -257,16 +260,26 @@ class InverseQP:
             raise ValueError("the condensed model contains values that are not finite")
         if self.goal_weights is not None and self.goal_weights.shape != goal.shape:
             raise ValueError(f"goal_weights must be {counted(goal.size, 'number')}, got {self.goal_weights.tolist()}")
-        self._check_near(goal)
+        self.check_near("goal", goal)
+        if self._robot is not None and len(self._robot.actuators) == count and not self.by_effort.any():
+            check_command(self._robot, command, "displacement")
         return goal, command
 
-    def _check_near(self, goals: np.ndarray) -> None:
-        """Raise ValueError for goals (..., n_e) far from the robot, in the coordinates that have a weight."""
+    def check_near(self, name: str, goals: np.ndarray) -> None:
+        """Check that effector coordinates are near the robot of `for_robot`, where their weights are not zero.
+
+        Args:
+            name: what they are, for messages.
+            goals: one or more coordinates of all effectors [m], shape (..., n_e).
+
+        Raises:
+            ValueError: for points farther from the effector at rest than three times the robot's size.
+        """
         robot = self._robot
         if robot is not None and goals.shape[-1] == 3 * len(robot.effectors):
             if self.goal_weights is not None:
                 goals = np.where(self.goal_weights > 0.0, goals, np.tile(robot.effector_rest, len(robot.effectors)))
-            robot.check_point("goal", goals.reshape(-1, 3))
+            robot.check_point(name, goals.reshape(-1, 3))
 
     def limits(
         self, condensed: CondensedModel, command: np.ndarray, slack: np.ndarray | None = None, size: float = 1.0
@@ -316,12 +329,14 @@ class InverseQP:
             slack: actuators that are slack, shape (n_a,); default none.
 
         Raises:
-            ValueError: if goal, command or model has a wrong shape or is not finite, or if the goal is far from the
-                robot of `for_robot`.
+            ValueError: if goal, command, slack or model has a wrong shape or is not finite, or if goal or command are
+                far beyond what the robot of `for_robot` can do.
             ConvergenceError: if ProxQP does not reach its tolerance, for example because no step within the rates
                 brings an effort back below ``max_effort``.
         """
         goal, command = self.checked(condensed, goal, command)
+        if slack is not None and np.shape(slack) != self.rates.shape:
+            raise ValueError(f"slack must have shape {self.rates.shape}, got {np.shape(slack)}")
         program = self._program(condensed, goal, command, slack)
         self._qp, found = self._solved(self._qp, program.arguments)
         if found is None:
@@ -347,7 +362,7 @@ class InverseQP:
         """
         if not all(np.isfinite(values).all() for values in (condensed.compliance, condensed.delta.array, goals)):
             raise ValueError("the condensed models or goals contain values that are not finite")
-        self._check_near(goals)
+        self.check_near("goal", goals)
         if len(self._rows) != len(commands):
             self._rows = [None] * len(commands)
         program = self._program(condensed, goals, commands, slack)

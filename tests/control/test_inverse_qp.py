@@ -7,7 +7,7 @@ import pytest
 
 from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
-from softgym_envs.control import ContactQP, EmbeddedLoop, InverseQP
+from softgym_envs.control import ContactQP, EmbeddedLoop, InverseQP, PICorrection
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.solvers.complementarity import solve_complementarity
@@ -409,6 +409,14 @@ def test_a_goal_in_millimetres_is_refused_by_the_controller_of_a_robot(kind):
     loop = EmbeddedLoop(lambda displacement: state.condensed, controller)
     with pytest.raises(ValueError, match="did you mean metres"):
         loop.step(1e3 * goal)
+    with pytest.raises(ValueError, match=r"command = 5 m of actuator 'cable_1' is far beyond its range .* its unit"):
+        controller.solve(state.condensed, goal, [5.0, 0.0])
+    closed = EmbeddedLoop(lambda displacement: state.condensed, controller, PICorrection())
+    with pytest.raises(ValueError, match=r"measured effector = .* did you mean metres"):
+        closed.step(goal, 1e3 * goal)
+    if kind is InverseQP:
+        with pytest.raises(ValueError, match=r"slack must have shape \(2,\), got \(3,\)"):
+            controller.solve(state.condensed, goal, state.command, [True] * 3)
     # A coordinate without a weight is free.
     kind.for_robot(robot, goal_weights=[1.0, 0.0, 1.0]).solve(state.condensed, goal + [0.0, 9.0, 0.0], state.command)
 
