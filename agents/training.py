@@ -16,10 +16,18 @@ from softgym_envs.agents.evaluation import Evaluation, evaluate, evaluation_set
 from softgym_envs.agents.learners import make_learner
 from softgym_envs.agents.learners.base import Learner, Tensors
 from softgym_envs.agents.policy import Policy, read_tensors, save_policy
-from softgym_envs.config import difference, load_stored, provenance, save_config, save_resolved
+from softgym_envs.config import (
+    continue_with_code,
+    difference,
+    load_stored,
+    provenance,
+    save_config,
+    save_resolved,
+)
 from softgym_envs.errors import DataError, WeightsError
 from softgym_envs.extras import require
 from softgym_envs.storage import atomic_write, read_json, write_json
+from softgym_envs.wording import counted
 
 if TYPE_CHECKING:
     from stable_baselines3 import SAC
@@ -71,7 +79,8 @@ def train(
     A folder with a checkpoint is extended by the same configuration with more ``steps``; a training that has not ended
     may also be shortened, to any number of steps from where it stands. What a learner plans over all steps, such as its
     learning rate, is from then on that of a training of the new number of steps. Until the training ends, the folder
-    keeps the previous policy, if there is one. ``provenance.json`` and the card list each change of the steps.
+    keeps the previous policy, if there is one. ``provenance.json`` and the card list each change of the steps, and
+    other code (commit or versions) than began the training.
 
     Args:
         config: configuration of the training.
@@ -111,6 +120,9 @@ def train(
         save_resolved(folder, config)
     elif earlier != config.steps:
         _save_extension(folder, config, earlier, run.learner.step)
+    change = continue_with_code(folder) if earlier is not None and run.learner.step else ""
+    if change and progress:
+        tqdm.write(f"warning: training '{folder}' was {change}; what they compute may differ")
     run.learner.log_to(folder)
 
     def stop() -> bool:
@@ -156,20 +168,20 @@ def _earlier_steps(config: TrainConfig, folder: Path) -> int | None:
     finished = _finished_steps(folder)
     if config.steps < finished:
         raise DataError(
-            f"'{folder}' holds a finished training of {finished} steps, got steps = {config.steps}; choose a new "
-            f"folder, or steps = {finished} or more"
+            f"'{folder}' holds a finished training of {counted(finished, 'step')}, got steps = {config.steps}; choose "
+            f"a new folder, or steps = {finished} or more"
         )
     path = folder / CHECKPOINT
     made = _meta(path)["curve"][-1]["step"] if finished < config.steps < stored.steps and path.exists() else 0
     if config.steps < made:
         raise DataError(
-            f"'{folder}' holds a training that has made {made} of {stored.steps} steps, got steps = {config.steps}; "
-            f"choose a new folder, or steps = {made} or more"
+            f"'{folder}' holds a training that has made {made} of {counted(stored.steps, 'step')}, got "
+            f"steps = {config.steps}; choose a new folder, or steps = {made} or more"
         )
     if 0 < finished < config.steps and not path.exists():
         raise DataError(
-            f"'{folder}' holds a finished training of {finished} steps without '{CHECKPOINT}', so it cannot be "
-            f"extended to {config.steps}; choose a new folder, and start from this policy with --initial "
+            f"'{folder}' holds a finished training of {counted(finished, 'step')} without '{CHECKPOINT}', so it cannot "
+            f"be extended to {config.steps}; choose a new folder, and start from this policy with --initial "
             f"{folder / POLICY}"
         )
     return stored.steps
@@ -283,8 +295,8 @@ class _Run:
             "curve": self._curve,
             "provenance": provenance(),
         }
-        if extensions := read_json(self._folder / "provenance.json").get("extensions"):
-            card["extensions"] = extensions
+        origin = read_json(self._folder / "provenance.json")
+        card |= {key: origin[key] for key in ("extensions", "continued") if key in origin}
         if self._proposer is not None:
             self._proposer.finish(_model(self.learner))
         save_policy(self._folder / POLICY, self._best, card)

@@ -15,6 +15,7 @@ from benchmarks.tables import markdown
 from softgym_envs.robots.registry import make_robot
 from softgym_envs.surrogate.model import SurrogateModel
 from softgym_envs.surrogate.pretrained import pretrained_model
+from softgym_envs.wording import decimal
 
 
 @dataclass(frozen=True)
@@ -112,16 +113,16 @@ def study_table(name: str) -> str:
     """Mean distance from the test goals of a study's baseline and winner, with each physics that judged them."""
     rows = []
     for row in results("codesign")[ROBOTS[name].study]["meshes"]:
-        change = f"{row['change [mm]']:.2f}"
+        change = decimal(row["change [mm]"], 2)
         if "change before [mm]" in row:
-            change += f" (mesh above: {row['change before [mm]']:.2f})"
+            change += f" (mesh above: {decimal(row['change before [mm]'], 2)})"
         for key, form in (("interval [mm]", "({} to {})"), ("with the mesh [mm]", "; with the mesh {} to {}")):
             ends = row.get(key)
-            change += (" " if form[0] == "(" else "") + form.format(*(f"{end:.2f}" for end in ends)) if ends else ""
+            change += (" " if form[0] == "(" else "") + form.format(*(decimal(end, 2) for end in ends)) if ends else ""
         unknowns = f"{row['unknowns']:,}" if row.get("unknowns") else ""
         known = [row.get(f"{body}, mean effort [N]") for body in BODIES]
         efforts = ["" if effort is None else f"{effort:.2f}" for effort in known]
-        cells = [f"{row[f'{body} [mm]']:.2f}" for body in BODIES]
+        cells = [decimal(row[f"{body} [mm]"], 2) for body in BODIES]
         rows.append([row["judge"], unknowns, str(row["goals"]), *cells, change, *efforts])
     head = [
         "judge",

@@ -6,6 +6,7 @@ case is a function that returns rows; the tests run them on coarse meshes.
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -554,6 +555,7 @@ def contact() -> dict[str, object]:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     import json
 
     print(json.dumps(contact(), indent=2))

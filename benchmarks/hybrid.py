@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import tempfile
 import time
 from pathlib import Path
@@ -128,5 +129,6 @@ def hybrid() -> dict[str, object]:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     for key, value in hybrid().items():
         print(f"{key:75s} {value:.6g}" if isinstance(value, float) else f"{key:75s} {value}")

@@ -14,6 +14,7 @@ stands beside models that learn from 64 of them:
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 import time
@@ -279,4 +280,5 @@ TABLES = {"motion": motion_table}
 """Tables of pages by name."""
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     json.dump(motion(), sys.stdout, indent=2)

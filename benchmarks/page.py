@@ -17,6 +17,7 @@ from ``benchmarks/data/recorded.json``. A test compares all pages with both file
 
 from __future__ import annotations
 
+import argparse
 import re
 import sys
 from pathlib import Path
@@ -102,5 +103,6 @@ def main() -> int:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     main()
     sys.exit(0)

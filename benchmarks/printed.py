@@ -7,6 +7,7 @@ stiffness that one cell gives, whose walls have the same elements.
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 
@@ -82,4 +83,5 @@ TABLES = {"printed": printed_table}
 """Tables of pages by name."""
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     json.dump(printed(), sys.stdout, indent=2)

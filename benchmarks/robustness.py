@@ -13,6 +13,7 @@ import numpy as np
 from benchmarks.recorded import figure, records, results
 from benchmarks.tables import markdown
 from softgym_envs.config import load_config
+from softgym_envs.wording import decimal
 
 if TYPE_CHECKING:
     from softgym_envs.agents.config import EnvironmentConfig
@@ -201,7 +202,7 @@ def sensed_table() -> str:
                 for what in ("goals reached [%]", "mean distance [mm]")
             )
             shares = ", ".join(f"{float(value):.0f}" for value in reached)
-            row.append(f"{shares} %, {np.mean([float(value) for value in distance]):.2f} mm")
+            row.append(f"{shares} %, {decimal(float(np.mean([float(value) for value in distance])), 2)} mm")
     names = [*SENSED, *TRAINED]
     return markdown(["plant", *names], rows, "l" + "r" * len(names))
 
@@ -215,7 +216,7 @@ def _on_plants(group: str, controllers: Iterable[str]) -> list[list[str]]:
             cells = [
                 figure(group, f"{key}: goals reached [%]", ".0f")
                 + " %, "
-                + figure(group, f"{key}: mean distance [mm]", ".2f")
+                + decimal(float(figure(group, f"{key}: mean distance [mm]")), 2)
                 + " mm"
                 for key in keys
             ]

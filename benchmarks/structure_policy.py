@@ -24,6 +24,7 @@ from softgym_envs.agents.policy import Policy
 from softgym_envs.config import provenance
 from softgym_envs.errors import DataError
 from softgym_envs.storage import write_json
+from softgym_envs.wording import decimal
 
 KEPT = Path(__file__).parent / "data" / "structure_policy.json"
 POLICY = "modular_reach_structures"
@@ -70,8 +71,8 @@ def table() -> str:
                 name,
                 f"{100.0 * np.mean(distances < 1e3 * REACHABLE):.0f} %",
                 f"{100.0 * np.mean(inside < 1e3 * REACHABLE):.0f} %",
-                f"{np.mean(inside):.2f} mm",
-                f"{np.median(inside):.2f} mm",
+                f"{decimal(float(np.mean(inside)), 2)} mm",
+                f"{decimal(float(np.median(inside)), 2)} mm",
             ]
         )
     solid, some = np.array(found["solid"]["policy"]), found["solid"]["bodies"]
@@ -80,7 +81,7 @@ def table() -> str:
     tau = kendalltau(*both.T)
     rows += [
         [f"policy, {len(solid)} bodies on solid finite elements", "", f"{int((solid < 1e3 * REACHABLE).sum())} of "
-         f"{len(solid)}", f"{solid.mean():.2f} mm", f"at most {apart:.2f} mm from superelements"],
+         f"{len(solid)}", f"{decimal(solid.mean(), 2)} mm", f"at most {decimal(apart, 2)} mm from superelements"],
         [f"order of {len(both)} bodies of a study: Kendall's tau", f"{tau.statistic:.2f}", "", "", ""],
     ]  # fmt: skip
     head = ["", f"all {len(near)} goals reached", f"of {int(near.sum())} within reach", "mean distance", "median"]

@@ -8,8 +8,8 @@ copies the comparison of each finished study into ``benchmarks/data/recorded.jso
 
 from __future__ import annotations
 
+import argparse
 import json
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.config import load_config
 from softgym_envs.errors import DataError
 from softgym_envs.storage import write_json
+from softgym_envs.wording import decimal
 
 RECORDED = SOURCES[0]
 
@@ -165,10 +166,14 @@ def main(folders: Sequence[str]) -> None:
         except DataError as error:
             raise SystemExit(f"nothing recorded: {error}") from None
         kept[name] = entry
-        print(f"{name}: {entry['rows'][0]['baseline [mm]']:.2f} -> {entry['rows'][0]['winner [mm]']:.2f} mm")
+        print(
+            f"{name}: {' -> '.join(decimal(entry['rows'][0][f'{who} [mm]'], 2) for who in ('baseline', 'winner'))} mm"
+        )
     recorded["codesign"]["results"] = {name: kept[name] for name in (*TITLES, *kept) if name in kept}
     write_json(RECORDED, recorded)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folders", metavar="FOLDER", nargs="+", help="of a finished study")
+    main(parser.parse_args().folders)

@@ -9,6 +9,7 @@ from benchmarks.learners import REPORTS, SCORES, TASKS, spread
 from benchmarks.recorded import figure, number, records, results
 from benchmarks.studies import JUDGES
 from softgym_envs.agents.results import LEARNERS, MODEL_BASED
+from softgym_envs.wording import decimal
 
 WEIGHTS = {
     "finger_1cable": "finger, 1 cable",
@@ -59,7 +60,7 @@ def headlines() -> str:
         name = f"{study['title']}; {row['controller'].partition(',')[0]}"
         finer = next((r for r in study.get("meshes", ()) if r["judge"] == JUDGES["refined"]), None)
         same = None if finer is None else (finer["change before [mm]"], finer["change [mm]"])
-        checked = "" if same is None else "{:.2f}\u00a0→\u00a0{:.2f}\u00a0mm".format(*same)
+        checked = "" if same is None else "{}\u00a0→\u00a0{}\u00a0mm".format(*(decimal(x, 2) for x in same))
         interval = _interval(row) or ()
         change = "{:.1f}\u00a0to\u00a0{:.1f}\u00a0mm".format(*interval)
         rows.append([name, *_ends(row), change, checked, f"`{study['command']}`"])
@@ -74,7 +75,8 @@ def _interval(row: dict[str, Any]) -> list[float] | None:
 
 def _ends(row: dict[str, Any]) -> list[str]:
     # No-break spaces keep numbers and units together.
-    return [f"{row['baseline [mm]']:.2f}\u00a0mm", f"→\u00a0{row['winner [mm]']:.2f}\u00a0mm"]
+    before, after = (decimal(row[f"{who} [mm]"], 2) for who in ("baseline", "winner"))
+    return [f"{before}\u00a0mm", f"→\u00a0{after}\u00a0mm"]
 
 
 def codesign() -> str:

@@ -17,6 +17,7 @@ import numpy as np
 
 from softgym_envs.errors import unknown_name
 from softgym_envs.registry import import_object
+from softgym_envs.wording import decimal
 
 if TYPE_CHECKING:
     from softgym_envs.agents.evaluation import Evaluation
@@ -79,11 +80,6 @@ class Objective:
     of_body: bool = False
 
     @property
-    def decimals(self) -> int:
-        """Decimals that tables show in ``unit``."""
-        return 1 if self.unit == "%" else 2
-
-    @property
     def sign(self) -> int:
         """1 if larger is better, else -1."""
         return 1 if self.maximize else -1
@@ -124,9 +120,8 @@ class Objective:
         return f"{self.number(value, sign)}{' ' + unit if unit else ''}"
 
     def number(self, value: float, sign: str = "") -> str:
-        """A value [SI] in ``unit``, without naming it."""
-        rounded = round(value * self.scale, self.decimals) + 0.0  # no negative zero
-        return f"{rounded:{sign}.{self.decimals}f}"
+        """A value [SI] in ``unit``, without naming it; two significant digits if it is small."""
+        return decimal(value * self.scale, 1 if self.unit == "%" else 2, sign)
 
     @property
     def axis(self) -> str:

@@ -10,6 +10,7 @@ from softgym_envs.codesign.folder import StudyFolder
 from softgym_envs.codesign.records import REFINED, FinalistTest, TestGroup, TrialResult
 from softgym_envs.codesign.report.results import Comparison, StudyResults
 from softgym_envs.codesign.report.units import present
+from softgym_envs.wording import counted
 
 PHYSICS = {REFINED: "fem with a finer mesh"}
 """Names of physics whose key does not say what they are."""
@@ -56,6 +57,7 @@ class Progress:
         self.objective = self.config.primary
         self.enabled = enabled
         self._seen: set[Path] = set()
+        self._warned: set[str] = set()
         self._best: TrialResult | None = None
         config = study.config
         phases = {
@@ -85,6 +87,12 @@ class Progress:
         """Print a line."""
         if self.enabled:
             print(line, flush=True)
+
+    def warn(self, text: str) -> None:
+        """Print a warning, once."""
+        if text not in self._warned:
+            self._warned.add(text)
+            self.say(f"warning: {text}")
 
     def _fresh(self, pattern: str) -> list[Path]:
         """Return files that appeared since the last call, in the order in which they were written."""
@@ -191,6 +199,6 @@ class Progress:
             low, high = sorted(row.distance_mesh.interval)
             interval += f", with the error of the mesh {measure.number(low, '+')} to {measure.text(high, '+')}"
         return (
-            f"{row.agent} on {PHYSICS.get(row.backend, row.backend)}, {row.goals} test goals: {', '.join(changes)} "
-            f"(change {measure.text(row.distance_change, '+')}{interval})"
+            f"{row.agent} on {PHYSICS.get(row.backend, row.backend)}, {counted(row.goals, 'test goal')}: "
+            f"{', '.join(changes)} (change {measure.text(row.distance_change, '+')}{interval})"
         )

@@ -30,9 +30,11 @@ from softgym_envs.codesign.scheduling.optuna_study import distributions, make_pr
 from softgym_envs.codesign.scheduling.processes import run_workers
 from softgym_envs.codesign.scheduling.queue import TrialQueue
 from softgym_envs.codesign.snapshot import load_study
+from softgym_envs.config import continue_with_code
 from softgym_envs.envs.options import design_names
 from softgym_envs.errors import ConfigError, ConvergenceError, InfeasibleDesign, SoftGymError
 from softgym_envs.extras import require
+from softgym_envs.wording import counted
 
 MIRROR_INTERVAL = 1.0
 """Time between two copies of results from other machines [s]."""
@@ -103,10 +105,10 @@ def run_study(
                 _run_finalists(study, count, output)
     except KeyboardInterrupt:
         done = len(study.result_files())
-        share = f"{done} of {config.trials}" if done <= config.trials else f"{done}"
+        share = f"{done} of {counted(config.trials, 'trial')}" if done <= config.trials else counted(done, "trial")
         tests = len(list(study.path.glob("finalists/trial*.json")))
-        more = f" and {tests} test{'s' * (tests != 1)} of finalists" if tests else ""
-        output.say(f"interrupted: {share} trials{more} finished; run the same command again to continue")
+        more = f" and {counted(tests, 'test')} of finalists" if tests else ""
+        output.say(f"interrupted: {share}{more} finished; run the same command again to continue")
         raise
     results = write_results(load_study(study))
     output.verdict(results)
@@ -164,19 +166,36 @@ def _try_sampler(config: StudyConfig) -> None:
         raise ConfigError(f"pruner '{pruner.name}' with pruner.options = {pruner.options}: {error}") from None
 
 
+def _run_workers(
+    study: StudyFolder, output: Progress, phase: str, count: int, tick: Callable[[], None] = lambda: None
+) -> str | None:
+    """Return what `run_workers` does; before, warn if other code began the study."""
+    with study.lock("study"):
+        change = continue_with_code(study.path)
+    if change:
+        output.warn(f"study '{study.path}' was {change}; what they compute may differ")
+    return run_workers(study, phase, count, tick)
+
+
 def _run_jobs(
-    study: StudyFolder, phase: str, missing: list[Job], workers: int, tick: Callable[[], None] = lambda: None
+    study: StudyFolder,
+    output: Progress,
+    phase: str,
+    missing: list[Job],
+    workers: int,
+    tick: Callable[[], None] = lambda: None,
 ) -> None:
-    stopped = run_workers(study, phase, min(workers, len(missing)), tick)
+    stopped = _run_workers(study, output, phase, min(workers, len(missing)), tick)
     _require(all(job.path.exists() for job in missing), phase, stopped)
 
 
 def _run_screen(study: StudyFolder, workers: int, output: Progress) -> None:
     jobs = screen_jobs(study)
     if missing := missing_jobs(study, jobs):
-        output.begin("screen", f"{len(missing)} bodies scored by the inverse QP", len(missing))
-        _run_jobs(study, "screen", missing, workers, lambda: output.screened(sum(job.path.exists() for job in missing)))
-    output.say(f"screen: kept {len(kept_bodies(study))} of {len(jobs)} bodies")
+        output.begin("screen", f"{counted(len(missing), 'body')} scored by the inverse QP", len(missing))
+        done = lambda: output.screened(sum(job.path.exists() for job in missing))  # noqa: E731
+        _run_jobs(study, output, "screen", missing, workers, done)
+    output.say(f"screen: kept {len(kept_bodies(study))} of {counted(len(jobs), 'body')}")
 
 
 def _make_shared_policy(study: StudyFolder, output: Progress) -> None:
@@ -184,7 +203,7 @@ def _make_shared_policy(study: StudyFolder, output: Progress) -> None:
         if study.config.plan.proposer:
             steps = study.config.joint.steps
             output.begin("shared policy", f"bodies and policy are trained together, {steps:,} steps", 1)
-        _run_jobs(study, "shared_policy", missing, 1)
+        _run_jobs(study, output, "shared_policy", missing, 1)
 
 
 def _run_trials(study: StudyFolder, workers: int, output: Progress) -> None:
@@ -206,12 +225,11 @@ def _run_trials(study: StudyFolder, workers: int, output: Progress) -> None:
         if left := queue.left():
             finished = len(study.result_files())
             total = finished + left  # more than config.trials if a study goes on with fewer than it was begun with
-            bodies = "1 body" if total == 1 else f"{total} bodies"
-            text = f"{bodies} of study '{config.name}', {finished} of them finished before"
+            text = f"{counted(total, 'body')} of study '{config.name}', {finished} of them finished before"
             output.begin("trials", text, total, finished)
         while queue.left():
             if queue.claimable():
-                stopped = run_workers(study, "trials", min(workers, queue.left()), tick)
+                stopped = _run_workers(study, output, "trials", min(workers, queue.left()), tick)
                 _require(stopped is None or queue.left() == 0, "trials", stopped)
             else:  # another call is running the last ones
                 tick()
@@ -230,14 +248,16 @@ def _run_finalists(study: StudyFolder, workers: int, output: Progress) -> None:
             return
         if missing := missing_jobs(study, jobs):
             if refinement is not None and snapshot.refinements:
-                text = f"baseline and winner on {refinement.goals} unseen goals, fem with a finer mesh"
+                text = f"baseline and winner on {counted(refinement.goals, 'unseen goal')}, fem with a finer mesh"
             else:
-                goals, backends = len(study.goals["unseen"]), " and ".join(study.config.test_backends)
-                text = f"{len(snapshot.finalists)} bodies on {goals} unseen goals, {backends}"
+                goals = counted(len(study.goals["unseen"]), "unseen goal")
+                text = (
+                    f"{counted(len(snapshot.finalists), 'body')} on {goals}, {' and '.join(study.config.test_backends)}"
+                )
             done = len(jobs) - len(missing)
-            before = f", {done} of {len(jobs)} tests finished before" if done else ""
+            before = f", {done} of {counted(len(jobs), 'test')} finished before" if done else ""
             output.begin("test", text + before, len(jobs), done)
-            _run_jobs(study, "finalists", missing, workers, output.tests)
+            _run_jobs(study, output, "finalists", missing, workers, output.tests)
 
 
 def _require(done: bool, phase: str, stopped: str | None) -> None:

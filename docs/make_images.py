@@ -7,6 +7,7 @@ picture ``report`` needs a finished study (``make demo``) and Chromium, so it is
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import shutil
@@ -232,8 +233,10 @@ def main(names: list[str]) -> None:
     table |= {"benchmark_regret": plots.draw_regret, "benchmark_winners": plots.draw_winners}
     table |= {name: partial(draw_robot, name) for name in ROBOTS}
     table |= {name: partial(draw_environment, name) for name in environment_pages()}
-    films = [f"{name}.webp" for name in environment_pages()]
-    for name in names or [*table, *films, "episodes"]:
+    every = [*table, *(f"{name}.webp" for name in environment_pages()), "episodes"]
+    if unknown := [name for name in names if name not in (*every, "report")]:
+        raise SystemExit(f"unknown pictures {', '.join(unknown)}; allowed: {', '.join(every)}, report")
+    for name in names or every:
         path = DOCS / "images" / f"{name.removesuffix('.webp')}.png"
         if name == "episodes":
             path = path.with_suffix(".webp")
@@ -248,4 +251,6 @@ def main(names: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", metavar="NAME", nargs="*", help="of a picture; default: all")
+    main(parser.parse_args().names)

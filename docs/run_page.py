@@ -5,6 +5,7 @@ The blocks share a namespace and run in the folder. A block with a title is writ
 
 from __future__ import annotations
 
+import argparse
 import os
 import re
 import sys
@@ -35,4 +36,8 @@ def run_page(page: Path, folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    run_page(Path(sys.argv[1]).resolve(), Path(sys.argv[2]).resolve())
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("page", type=Path)
+    parser.add_argument("folder", type=Path)
+    given = parser.parse_args()
+    run_page(given.page.resolve(), given.folder.resolve())

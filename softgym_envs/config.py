@@ -6,7 +6,7 @@ import platform
 import re
 import reprlib
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from pydantic_core import ErrorDetails
 
 from softgym_envs.errors import ConfigError, unknown_name
-from softgym_envs.storage import atomic_write, write_json
+from softgym_envs.storage import atomic_write, read_json, write_json
 from softgym_envs.version import __version__
 
 
@@ -297,6 +297,38 @@ def provenance() -> dict[str, Any]:
         "platform": platform.platform(),
         "versions": versions,
     }
+
+
+def code_change(begun: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    """Return how the code differs between two of `provenance`: ``"begun with A; continued with B"``, or ``""``.
+
+    A commit or version that one of them does not know is no difference.
+    """
+    before, after = ({"commit": made.get("commit"), **made.get("versions", {})} for made in (begun, now))
+    changed = [name for name in before if None not in (before[name], after.get(name)) and before[name] != after[name]]
+    if not changed:
+        return ""
+    old, new = (", ".join(f"{name} {made[name]}" for name in changed) for made in (before, after))
+    return f"begun with {old}; continued with {new}"
+
+
+def continue_with_code(folder: str | Path) -> str:
+    """Record in the provenance of a results folder that other code than began it continues it.
+
+    Call it before the first work that the folder does not have yet.
+
+    Returns:
+        The `code_change`, for a warning.
+    """
+    path = Path(folder) / "provenance.json"
+    if not path.exists():
+        return ""
+    begun, now = read_json(path), provenance()
+    change = code_change(begun, now)
+    continued = begun.get("continued", [])
+    if change and all(code_change(begun, other) != change for other in continued):
+        write_json(path, {**begun, "continued": [*continued, now]})
+    return change
 
 
 def save_resolved(folder: str | Path, config: Config) -> None:

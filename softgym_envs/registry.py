@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
 from softgym_envs.errors import unknown_name
+from softgym_envs.wording import counted
 
 
 class Registry(Mapping[str, type]):
@@ -297,6 +298,6 @@ def _described(annotation: Any) -> str:
     if origin in (Union, types.UnionType):
         return " or ".join(map(_described, arguments))
     if origin is tuple and set(arguments) <= {int, float}:
-        return f"{len(arguments)} numbers"
+        return counted(len(arguments), "number")
     words = {float: "a number", int: "an integer", bool: "true or false", str: "a string", type(None): "none"}
     return words.get(annotation, str(annotation))

@@ -8,9 +8,19 @@ from typing import Any
 import pytest
 
 from softgym_envs.agents import EnvironmentConfig, TrainConfig
-from softgym_envs.config import Config, check_compatible, check_config, commit_of, difference
+from softgym_envs.config import (
+    Config,
+    check_compatible,
+    check_config,
+    code_change,
+    commit_of,
+    continue_with_code,
+    difference,
+    provenance,
+)
 from softgym_envs.errors import ConfigError, DataError
-from softgym_envs.storage import JsonLines, drop_torn_line, read_json
+from softgym_envs.storage import JsonLines, drop_torn_line, read_json, write_json
+from softgym_envs.version import __version__
 
 
 class Inner(Config):
@@ -125,3 +135,27 @@ def test_the_value_is_named_once(key, value, end):
     with pytest.raises(ConfigError) as caught:
         check_config(TrainConfig, data, "here")
     assert str(caught.value).endswith(end) and str(caught.value).count("got") == 1
+
+
+def test_code_that_changed_is_named_on_both_sides():
+    begun = {"commit": "aaa", "versions": {"softgym-envs": "0.1.0", "numpy": "2.1", "torch": "2.4"}}
+    assert code_change(begun, begun) == ""
+    assert code_change(begun, {"commit": None, "versions": {"softgym-envs": "0.1.0", "numpy": "2.1"}}) == ""  # unknown
+    after = {"commit": "bbb", "versions": {"softgym-envs": "0.2.0", "numpy": "2.1"}}
+    assert code_change(begun, after) == (
+        "begun with commit aaa, softgym-envs 0.1.0; continued with commit bbb, softgym-envs 0.2.0"
+    )
+
+
+def test_continuing_with_other_code_is_recorded_once(tmp_path):
+    assert continue_with_code(tmp_path) == ""  # nothing was begun
+    path, begun = tmp_path / "provenance.json", provenance()
+    write_json(path, begun)
+    assert continue_with_code(tmp_path) == "" and read_json(path) == begun
+    begun["versions"]["softgym-envs"] = "0.0.1"
+    write_json(path, begun)
+    texts = {continue_with_code(tmp_path) for _ in range(2)}
+    assert texts == {f"begun with softgym-envs 0.0.1; continued with softgym-envs {__version__}"}
+    stored = read_json(path)
+    (continued,) = stored.pop("continued")
+    assert stored == begun and continued["versions"]["softgym-envs"] == __version__

@@ -25,6 +25,7 @@ from softgym_envs.codesign.benchmark.table import (
 from softgym_envs.codesign.benchmark.winners import rank_correlation, stored_winners
 from softgym_envs.codesign.objectives import Objective
 from softgym_envs.errors import DataError
+from softgym_envs.wording import counted
 
 SUBMISSIONS = DATA / "submissions"
 """Accepted submissions, one JSON file each."""
@@ -230,7 +231,7 @@ def reference_table(data: Path = DATA) -> str:
             best = (
                 shown(known.best[0][0])
                 if len(known.baseline) == 1
-                else f"a front of {len(set(map(tuple, known.best)))} bodies"
+                else f"a front of {counted(len(set(map(tuple, known.best))), 'body')}"
             )
             found = f"{known.found.get('method')}, judge {known.found.get('judge')}"
         accurate = " and ".join(shown(score) for score in known.accurate) or "-"
@@ -257,8 +258,8 @@ def winners_table(data: Path = DATA) -> str:
             cells.append([f"`{name}`", row.method, f"{row.seed}", *values])
         gaps = unit.scale * np.array([row.exploitation for row in members if row.fem is not None])
         notes.append(
-            f"* `{name}`: {len(members)} winners; exploitation {gaps.min():.4f} to {gaps.max():.4f} {unit.unit}, "
-            f"mean {gaps.mean():.4f} {unit.unit}; Kendall's tau {rank_correlation(members):.2f}."
+            f"* `{name}`: {counted(len(members), 'winner')}; exploitation {gaps.min():.4f} to {gaps.max():.4f} "
+            f"{unit.unit}, mean {gaps.mean():.4f} {unit.unit}; Kendall's tau {rank_correlation(members):.2f}."
         )
     header = ["problem", "method", "median seed", "learned model [mm]", "finite elements [mm]", "exploitation [mm]"]
     return _table(header, cells) + "\n\n" + "\n".join(notes)

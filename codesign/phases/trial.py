@@ -19,6 +19,7 @@ from softgym_envs.codesign.problem import StudyProblem
 from softgym_envs.codesign.records import Assessment, TrialResult
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 from softgym_envs.storage import read_json
+from softgym_envs.wording import counted
 
 if TYPE_CHECKING:
     import optuna
@@ -90,7 +91,7 @@ def run_trial(folder: StudyFolder, trial: optuna.Trial) -> TrialResult:
 def give_up(folder: StudyFolder, trial: optuna.Trial) -> TrialResult:
     """Write and return the result of a body whose evaluation crashed too many workers; see `run_trial`."""
     result = _new_result(folder, trial)
-    result.state, result.reason = "infeasible", f"evaluation crashed {folder.config.attempts} workers"
+    result.state, result.reason = "infeasible", f"evaluation crashed {counted(folder.config.attempts, 'worker')}"
     result.finished_at = time.time()
     result.write(folder.trial(trial.number) / "result.json")
     return result
@@ -186,7 +187,7 @@ class _Runner:
             if self.prunable and start + batch < count and trial.should_prune():
                 seen = start + len(values)
                 self.result.state = "pruned"
-                self.result.reason = f"stopped by the pruner after {seen} of {count} goals"
+                self.result.reason = f"stopped by the pruner after {seen} of {counted(count, 'goal')}"
                 break
         return measure(self.config, self.environment, Evaluation.merge(parts), self.result.design)
 
@@ -210,7 +211,7 @@ class _Runner:
         result.training_steps = max(reporter.curve, default=0) if pruned else config.training.steps
         if not pruned:
             return policy
-        result.state, result.reason = "pruned", f"stopped by the pruner after {result.training_steps} steps"
+        result.state, result.reason = "pruned", f"stopped by the pruner after {counted(result.training_steps, 'step')}"
         return None
 
 

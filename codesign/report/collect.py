@@ -30,7 +30,9 @@ from softgym_envs.codesign.report.statistics import (
     rate_interval,
 )
 from softgym_envs.codesign.snapshot import StudySnapshot
-from softgym_envs.config import provenance
+from softgym_envs.config import code_change, provenance
+from softgym_envs.storage import read_json
+from softgym_envs.wording import counted
 
 FEW_GOALS = 10
 """With fewer test goals a difference may well be chance."""
@@ -57,7 +59,7 @@ def collect(snapshot: StudySnapshot) -> StudyResults:
         baseline=baseline,
         winner=winner,
         no_winner=snapshot.verdict.reason,
-        few_goals=f"Only {few} test goals: the difference may be chance." if few < FEW_GOALS else "",
+        few_goals=f"Only {counted(few, 'test goal')}: the difference may be chance." if few < FEW_GOALS else "",
         comparison=comparison,
         pareto=snapshot.pareto if config.secondary_objectives else [],
         transfer=[
@@ -71,8 +73,15 @@ def collect(snapshot: StudySnapshot) -> StudyResults:
         importance=_importance(snapshot),
         cost=_cost(snapshot),
         success_distance=config.success_distance,
-        provenance=provenance(),
+        provenance={**provenance(), "code_changes": _code_changes(snapshot)},
     )
+
+
+def _code_changes(snapshot: StudySnapshot) -> list[str]:
+    """Return which other code than began the study continued it."""
+    path = snapshot.folder.path / "provenance.json"
+    begun = read_json(path) if path.exists() else {}
+    return [code_change(begun, now) for now in begun.get("continued", [])]
 
 
 def _variables(config: StudyConfig, winner: Finalist | None) -> list[VariableResult]:

@@ -11,6 +11,7 @@ from softgym_envs.codesign.report.results import StudyResults
 from softgym_envs.codesign.report.statistics import MIN_GOALS, mean_interval
 from softgym_envs.codesign.report.units import present
 from softgym_envs.codesign.snapshot import StudySnapshot
+from softgym_envs.wording import counted
 
 NEGLIGIBLE = 0.1
 """A difference of mean distances below this share of the success distance does not matter."""
@@ -32,10 +33,12 @@ class Finding:
 
 
 def findings(snapshot: StudySnapshot, results: StudyResults) -> list[Finding]:
-    """Return the findings of a study, the most important ones first; none without a winner."""
+    """Return the findings of a study, the most important ones first; without a winner only that its code changed."""
     if results.winner is None:
-        return []
+        found = [_code(results)]
+        return [finding for finding in found if finding is not None]
     found = [
+        _code(results),
         _goals(snapshot, results),
         _mesh(snapshot, results),
         _failures(snapshot),
@@ -48,6 +51,18 @@ def findings(snapshot: StudySnapshot, results: StudyResults) -> list[Finding]:
     return [finding for finding in found if finding is not None]
 
 
+def _code(results: StudyResults) -> Finding | None:
+    """Return whether the results come from more than one state of the code."""
+    changes = results.provenance.get("code_changes")
+    if not changes:
+        return None
+    text = ". ".join(f"The study was {change}" for change in changes)
+    return Finding(
+        "The code changed during the study",
+        f"{text}. What they compute may differ; a study in a new folder has one state of the code.",
+    )
+
+
 def _goals(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:
     row = next((row for row in results.comparison if row.backend == "fem"), None)
     if row is None:
@@ -58,11 +73,11 @@ def _goals(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:
     if not missed:
         return Finding(
             "Every test goal is reached",
-            f"All {row.goals} goals on FEM, with a final {scale.name} of at most {limit}.",
+            f"{counted(row.goals, 'goal')} on FEM, each with a final {scale.name} of at most {limit}.",
             warns=False,
         )
     worst = f"The largest {scale.name} is {scale.text(row.winner.worst_distance, 2)}."
-    title = f"{missed} of {row.goals} test goals are not reached"
+    title = f"{missed} of {counted(row.goals, 'test goal')} {'is' if missed == 1 else 'are'} not reached"
     return Finding(title, f"A goal is reached with a final {scale.name} of at most {limit}. {worst}")
 
 
@@ -83,7 +98,7 @@ def _mesh(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:
     measure, mesh, own = snapshot.config.distance, coarse.distance_mesh, "the mesh of the study"
     kinds = f", half of them missed by the baseline on {own}," if finer.choose == "missed" else ""
     text = (
-        f"At {fine.goals} goals{kinds} the change is {measure.text(fine.distance_change, '+')} there, and "
+        f"At {counted(fine.goals, 'goal')}{kinds} the change is {measure.text(fine.distance_change, '+')} there, and "
         f"{measure.text(mesh.before, '+')} on {own}. "
     )
     if mesh.interval is None:
@@ -101,7 +116,10 @@ def _failures(snapshot: StudySnapshot) -> Finding | None:
     if not failed:
         return None
     texts = ". ".join(f"Trial {trial}: {error}" for trial, error in failed.items())
-    return Finding(f"{len(failed)} of {len(snapshot.finalists)} bodies fail on FEM", f"They cannot win. {texts}.")
+    title = (
+        f"{len(failed)} of {counted(len(snapshot.finalists), 'body')} {'fails' if len(failed) == 1 else 'fail'} on FEM"
+    )
+    return Finding(title, f"{'It' if len(failed) == 1 else 'They'} cannot win. {texts}.")
 
 
 def _limit(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:
@@ -140,7 +158,7 @@ def _bounds(results: StudyResults) -> Finding | None:
     ]
     count = sum(variable.optimised for variable in results.variables)
     return Finding(
-        f"{len(ended)} of {count} variables at a limit",
+        f"{len(ended)} of {counted(count, 'variable')} at a limit",
         f"The winner has its {' and its '.join(parts)}. A better body may lie beyond. If it can be made, widen the "
         "range: for a dimension in the robot's design space, whose surrogate is then fitted anew; for an option under "
         "ranges.",

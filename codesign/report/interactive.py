@@ -13,6 +13,7 @@ from softgym_envs.codesign.report.plots import BASELINE, COLOURS, MUTED, VIOLATE
 from softgym_envs.codesign.report.results import StudyResults
 from softgym_envs.codesign.report.units import present, shown_unit
 from softgym_envs.codesign.snapshot import StudySnapshot
+from softgym_envs.wording import decimal
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
@@ -210,8 +211,8 @@ class GoalOutcomes:
     def texts(self, chosen: np.ndarray) -> list[str]:
         """Return what a plot says of goals under the pointer; ``chosen`` is a mask (n,)."""
         return [
-            f"goal ({', '.join(f'{1e3 * v:.1f}' for v in point)}) mm<br>baseline ends {1e3 * before:.2f} mm away"
-            f"<br>winner ends {1e3 * after:.2f} mm away"
+            f"goal ({', '.join(f'{1e3 * v:.1f}' for v in point)}) mm"
+            f"<br>baseline ends {decimal(1e3 * before, 2)} mm away<br>winner ends {decimal(1e3 * after, 2)} mm away"
             for point, (before, after) in zip(self.points[chosen], self.distances.T[chosen], strict=True)
         ]
 

@@ -20,6 +20,7 @@ from softgym_envs.codesign.report.sentences import KeyFigure
 from softgym_envs.codesign.snapshot import StudySnapshot, load_study
 from softgym_envs.errors import SoftGymError
 from softgym_envs.storage import atomic_write
+from softgym_envs.wording import counted
 
 
 @dataclass(frozen=True)
@@ -120,7 +121,7 @@ def write_report(folder: str | Path) -> Path:
     )
     path = snapshot.folder.path / "report.html"
     with atomic_write(path, "w") as stream:
-        stream.write(environment.get_template("report.html.j2").render(vars(page)))
+        stream.write(environment.get_template("report.html.j2").render(vars(page), counted=counted))
     return path
 
 

@@ -147,7 +147,7 @@ class StudyResults(Record):
         importance: how much each variable decides between good and bad bodies.
         cost: environment steps and time.
         success_distance: distance within which a goal counts as reached.
-        provenance: versions, commit, time and machine.
+        provenance: versions, commit, time and machine; ``code_changes``: other code that continued the study.
     """
 
     name: str

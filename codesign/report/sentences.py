@@ -15,6 +15,7 @@ from softgym_envs.codesign.report.statistics import MIN_GOALS, MeshPart, kendall
 from softgym_envs.codesign.report.tables import BACKENDS, SHOWN_ALWAYS, percent
 from softgym_envs.codesign.report.units import present, time_text
 from softgym_envs.codesign.snapshot import StudySnapshot
+from softgym_envs.wording import counted, decimal
 
 CONTROLLERS = {
     "warm_start": "a policy fine-tuned in each trial from a shared policy",
@@ -53,8 +54,9 @@ def headline(snapshot: StudySnapshot, results: StudyResults) -> str:
     sentences = [
         _finding(snapshot, row),
         f"On {BACKENDS[row.backend]}, with {'its own policy' if row.agent == 'policy' else 'the inverse QP'}, its "
-        f"{measure.label.lower()} over {row.goals} test goals is {measure.text(row.winner.mean_distance)} instead of "
-        f"{measure.text(row.baseline.mean_distance)} (difference {measure.text(row.distance_change, '+')}"
+        f"{measure.label.lower()} over {counted(row.goals, 'test goal')} is "
+        f"{measure.text(row.winner.mean_distance)} instead of {measure.text(row.baseline.mean_distance)} "
+        f"(difference {measure.text(row.distance_change, '+')}"
         f"{_interval(row.distance_change_interval, measure, row.distance_mesh)}). It reaches "
         f"{percent(row.winner.success_rate)} of the goals with a final {scale.name} of at most "
         f"{scale.limit_text(results.success_distance)}, the baseline {percent(row.baseline.success_rate)}.",
@@ -128,9 +130,9 @@ def key_figures(snapshot: StudySnapshot, results: StudyResults) -> list[KeyFigur
         add(f"{results.trials['feasible']}", label)
     transfer = [row for row in results.transfer if row.objective == objective.name]
     if transfer and transfer[0].spearman is not None:
-        label = f"rank correlation of surrogate and FEM, {len(transfer[0].trials)} bodies"
+        label = f"rank correlation of surrogate and FEM, {counted(len(transfer[0].trials), 'body')}"
         add(f"{transfer[0].spearman:.2f}", label)
-    add(time_text(sum(results.cost.cpu_seconds.values())), f"CPU time for {results.bodies} bodies")
+    add(time_text(sum(results.cost.cpu_seconds.values())), f"CPU time for {counted(results.bodies, 'body')}")
     return figures
 
 
@@ -151,16 +153,17 @@ def _problem(snapshot: StudySnapshot, results: StudyResults) -> list[tuple[str, 
     count = len(snapshot.folder.goals["selection"])
     rows = [
         ("Task", f"{results.environment}; success is {reached}"),
-        ("Body", f"{len(optimised)} variable{'s' * (len(optimised) != 1)}: {ranges}"),
-        ("Objective", f"{objective.axis_inside} on {count} goals, {direction}"),
+        ("Body", f"{counted(len(optimised), 'variable')}: {ranges}"),
+        ("Objective", f"{objective.axis_inside} on {counted(count, 'goal')}, {direction}"),
     ]
     if config.constraints:
         texts = (config.objectives[name].constraint_text(limit) for name, limit in config.constraints.items())
-        satisfied = f"{results.trials['feasible']} of {results.trials['complete']} complete trials satisfy them"
+        complete = counted(results.trials["complete"], "complete trial")
+        satisfied = f"{results.trials['feasible']} of {complete} satisfy them"
         rows.append(("Constraints", f"{'; '.join(texts)}; {satisfied}"))
     if config.secondary_objectives:
         labels = ", ".join(config.objectives[name].axis_inside for name in config.secondary_objectives)
-        rows.append(("Secondary objectives", f"{labels}; {len(results.pareto)} bodies on the Pareto front"))
+        rows.append(("Secondary objectives", f"{labels}; {counted(len(results.pareto), 'body')} on the Pareto front"))
     return rows
 
 
@@ -170,14 +173,14 @@ def _method(snapshot: StudySnapshot, results: StudyResults) -> list[tuple[str, s
     if _uses_goals_of_search(snapshot):
         others = "the task has only one path, so the final test uses the same"
     else:
-        others = f"{len(snapshot.folder.goals['unseen'])} others for the final test"
+        others = f"{counted(len(snapshot.folder.goals['unseen']), 'other')} for the final test"
     done = ", ".join(f"{results.trials[s]} {s}" for s in ("complete", "pruned", "infeasible"))
     backend = BACKENDS.get(config.environment.backend, config.environment.backend)
     rows = [
         ("Physics", f"{backend} in the search; {_tested(snapshot)}"),
         ("Controller", CONTROLLERS[config.strategy]),
         ("Goals", f"{_origin_of_goals(snapshot)}; {others}"),
-        ("Budget", f"{max(config.trials, results.bodies)} bodies ({done})"),
+        ("Budget", f"{counted(max(config.trials, results.bodies), 'body')} ({done})"),
     ]
     if config.plan.trains:
         rows.append(("Training", f"{config.training.steps:,} environment steps in each trial"))
@@ -185,11 +188,13 @@ def _method(snapshot: StudySnapshot, results: StudyResults) -> list[tuple[str, s
         rows.append(("Training", f"{config.joint.steps:,} environment steps on many bodies, none in the trials"))
     rows.append(("Search", f"sampler {config.sampler.name}, pruner {config.pruner.name}"))
     if (screen := config.screen).enabled:
-        scored = f"{screen.candidates} bodies on {screen.goals} goals"
-        rows.append(("Screen", f"before the search, the inverse QP scored {scored}; {screen.kept} became trials"))
+        scored = f"{counted(screen.candidates, 'body')} on {counted(screen.goals, 'goal')}"
+        kept = "one of them became a trial" if screen.kept == 1 else f"{screen.kept} of them became trials"
+        rows.append(("Screen", f"before the search, the inverse QP scored {scored}; {kept}"))
     if config.finalists.seeds:
         steps = config.finalists.steps or config.training.steps
-        rows.append(("Final test", f"{config.finalists.seeds} policies trained anew for each body, {steps:,} steps"))
+        policies = counted(config.finalists.seeds, "policy")
+        rows.append(("Final test", f"{policies} trained anew for each body, {steps:,} steps"))
     return rows
 
 
@@ -212,7 +217,7 @@ def _tested(snapshot: StudySnapshot) -> str:
     if finalists.test == "ends":
         text += (
             ", where episodes end: from the command at which an episode on the surrogate ends the inverse QP settles, "
-            f"and a policy takes {finalists.last_steps} more steps"
+            f"and a policy takes {counted(finalists.last_steps, 'more step')}"
         )
     if (finer := finalists.refinement) is not None:
         options = ", ".join(f"{name} = {value}" for name, value in finer.robot_options.items())
@@ -250,13 +255,13 @@ def mesh_note(snapshot: StudySnapshot, results: StudyResults) -> str:
         else ""
     )
     note = (
-        f"“With the mesh” adds what is left of the mesh's error: the change on {mesh.goals} goals{kinds} on both "
-        "meshes, extrapolated linearly to elements of size zero (those of the finer mesh are "
+        f"“With the mesh” adds what is left of the mesh's error: the change on {counted(mesh.goals, 'goal')}{kinds} on "
+        "both meshes, extrapolated linearly to elements of size zero (those of the finer mesh are "
         f"{mesh.ratio:.2f} times as large), would be {measure.text(mesh.left, '+')} more ({low} to {high})."
     )
     motions = [test.last_motion for test in results.tests if test.last_motion is not None]
     if motions:
-        note += f" The last step of a policy moved the effector by at most {1e3 * max(motions):.2f} mm."
+        note += f" The last step of a policy moved the effector by at most {decimal(1e3 * max(motions), 2)} mm."
     return note
 
 
@@ -302,8 +307,8 @@ def search_notes(snapshot: StudySnapshot, results: StudyResults) -> list[str]:
         spearman, kendall = rank_correlation(*scores), kendall_tau(*scores)
         if spearman is not None and kendall is not None:
             notes.append(
-                f"Rank correlation between {judge} and the controllers of the trials over {len(both)} bodies: "
-                f"{spearman:.2f} (Spearman), {kendall:.2f} (Kendall's tau)."
+                f"Rank correlation between {judge} and the controllers of the trials over "
+                f"{counted(len(both), 'body')}: {spearman:.2f} (Spearman), {kendall:.2f} (Kendall's tau)."
             )
     if results.importance:
         notes.append(

@@ -13,6 +13,7 @@ from softgym_envs.codesign.report.results import Comparison, Cost, StudyResults,
 from softgym_envs.codesign.report.statistics import MeshPart
 from softgym_envs.codesign.report.units import present, shown_unit, time_text
 from softgym_envs.codesign.snapshot import StudySnapshot
+from softgym_envs.wording import decimal
 
 AGENTS = {"policy": "Policy", "qp": "Inverse QP"}
 BACKENDS = {"fem": "FEM", REFINED: "FEM, finer mesh", "surrogate": "Surrogate"}
@@ -110,8 +111,9 @@ def design_row(variable: VariableResult) -> DesignRow:
     """Return a variable of baseline and winner."""
     unit, baseline, winner = variable.unit, variable.baseline, variable.winner
     name, factor, decimals = shown_unit(unit)
-    changed = winner is not None and winner != baseline
-    change = f"{(winner - baseline) * factor:+.{decimals}f}{' ' + name if name else ''}" if changed and winner else "-"
+    change = "-"
+    if winner is not None and winner != baseline:
+        change = f"{decimal((winner - baseline) * factor, decimals, '+')}{' ' + name if name else ''}"
     return DesignRow(
         name=variable.name.replace("_", " "),
         optimised=variable.optimised,

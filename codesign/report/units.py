@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from softgym_envs.wording import decimal
+
 SHOWN = {"m": ("mm", 1e3, 2), "Pa": ("kPa", 1e-3, 0), "1": ("", 1.0, 3)}
 
 
@@ -13,7 +15,7 @@ def shown_unit(unit: str) -> tuple[str, float, int]:
 def present(value: float, unit: str) -> str:
     """Return a quantity [unit] as people read it: ``"41.50 mm"``."""
     name, factor, decimals = shown_unit(unit)
-    return f"{value * factor:.{decimals}f}{' ' + name if name else ''}"
+    return f"{decimal(value * factor, decimals)}{' ' + name if name else ''}"
 
 
 def time_text(seconds: float) -> str:

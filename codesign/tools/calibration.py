@@ -19,6 +19,7 @@ from softgym_envs.codesign.tools.records import CalibrationResult, Fit
 from softgym_envs.config import provenance
 from softgym_envs.errors import ConfigError, ConvergenceError, InfeasibleDesign
 from softgym_envs.storage import write_json
+from softgym_envs.wording import counted
 
 MIN_SENSITIVITY = 1e-7
 """Smallest norm of the derivatives of all relative residuals with respect to a parameter that can be fitted."""
@@ -142,7 +143,7 @@ def fit_tpe(misfit: Misfit, start: Mapping[str, float], *, trials: int = 250, se
     study.enqueue_trial(dict(zip(parameters.names, first.tolist(), strict=True)))
     study.optimize(cost, n_trials=trials, catch=(ConvergenceError, InfeasibleDesign))
     if not history:
-        raise ConvergenceError(f"none of {trials} trials has an equilibrium under the measured commands")
+        raise ConvergenceError(f"none of {counted(trials, 'trial')} has an equilibrium under the measured commands")
     return Fit(
         start=_named(parameters, first),
         found=_named(parameters, np.array([study.best_params[name] for name in parameters.names])),

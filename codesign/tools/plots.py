@@ -14,6 +14,7 @@ from softgym_envs.codesign.report.units import shown_unit
 from softgym_envs.codesign.tools.metrics import Metric
 from softgym_envs.codesign.tools.records import CalibrationResult
 from softgym_envs.storage import atomic_write
+from softgym_envs.wording import counted
 
 
 @contextmanager
@@ -105,8 +106,8 @@ def draw_front(
         else:
             for k, axis in enumerate(axes, start=1):
                 x, y = shown[:, 0], shown[:, k]
-                axis.scatter(x, y, s=7, color=MUTED, label=f"{len(shown)} designs")
-                axis.scatter(x[front], y[front], s=16, color=WINNER, label=f"front, {len(front)} designs")
+                axis.scatter(x, y, s=7, color=MUTED, label=counted(len(shown), "design"))
+                axis.scatter(x[front], y[front], s=16, color=WINNER, label=f"front, {counted(len(front), 'design')}")
                 for name, point in (references or {}).items():
                     place = (scale[0] * point[0], scale[k] * point[k])
                     axis.scatter(*place, s=50, marker="D", color=BASELINE, zorder=3)

@@ -20,6 +20,7 @@ from softgym_envs.codesign.tools.records import FrontDesign, SearchResult
 from softgym_envs.config import provenance
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.storage import atomic_write, write_json
+from softgym_envs.wording import counted
 
 if TYPE_CHECKING:
     import optuna
@@ -159,7 +160,7 @@ class _Search:
         feasible = [trial for trial in self.trials() if trial.values is not None]
         if not feasible:
             raise ConvergenceError(
-                f"none of {len(evaluations)} designs is feasible; the first: {evaluations[0].infeasible}"
+                f"none of {counted(len(evaluations), 'design')} is feasible; the first: {evaluations[0].infeasible}"
             )
         best = [trial for trial in self._study.best_trials if not _evaluation(trial).repeated]
         best.sort(key=lambda trial: (trial.values[0], trial.number))

@@ -8,6 +8,9 @@ from typing import Any
 
 import numpy as np
 
+MOST_STEPS = 10_000
+"""Largest number of time steps in a control step: more would run for minutes, and a unit is probably wrong."""
+
 
 def shared_options(options: Mapping[str, Any]) -> dict[str, Any]:
     """Return those options of a backend that mean the same on any other: whether and how bodies move in time."""
@@ -26,7 +29,7 @@ class TimeSteps:
         stiffness_damping: Rayleigh's beta [s].
 
     Raises:
-        ValueError: for a step that is not positive, or a negative damping.
+        ValueError: for a step that is not positive, too many time steps in a control step, or a negative damping.
     """
 
     control_step: float = 0.05
@@ -39,6 +42,11 @@ class TimeSteps:
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0.0):
                 raise ValueError(f"{name} = {value} s must be positive and finite")
+        if self.control_step > MOST_STEPS * self.time_step:
+            raise ValueError(
+                f"time_step = {self.time_step:g} s divides control_step = {self.control_step:g} s into more than "
+                f"{MOST_STEPS} steps; check their units"
+            )
         for name in ("mass_damping", "stiffness_damping"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0.0):

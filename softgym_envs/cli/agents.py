@@ -6,13 +6,19 @@ import json
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from softgym_envs.cli import options
 from softgym_envs.cli.environments import AGENT_HELP
 from softgym_envs.errors import ConfigError
+from softgym_envs.wording import counted
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from softgym_envs.agents.evaluation import Bodies
 
 
 @click.command()
@@ -71,11 +77,12 @@ def evaluate(
 ) -> None:
     """Evaluate agents on the same unseen goals.
 
-    --config is the one that the policies were trained with.
+    --config is the one that the policies were trained with. If it draws bodies (sample_design), each goal has a drawn
+    body of its own, as in training, and the environment's own body is evaluated next; --design replaces both.
     """
     from softgym_envs.agents.baselines import BASELINES
     from softgym_envs.agents.config import TrainConfig
-    from softgym_envs.agents.evaluation import check_agent, sample_goals
+    from softgym_envs.agents.evaluation import check_agent, evaluation_set, sample_goals
     from softgym_envs.agents.evaluation import evaluate as run
     from softgym_envs.agents.policy import Policy
     from softgym_envs.config import load_config, provenance
@@ -91,20 +98,30 @@ def evaluate(
         check_agent(agent)
         if agent not in BASELINES:
             Policy(agent).check_environment(environment)
-    points = sample_goals(environment.model_copy(update={"sample_design": False}), goals, seed, chosen)
+    single = sample_goals(environment.model_copy(update={"sample_design": False}), goals, seed, chosen)
+    # What the results are of: its name and its heading, the bodies and their goals.
+    parts: list[tuple[str, str, Bodies, np.ndarray]] = [("one", "", chosen, single)]
+    drawn = None
+    if environment.sample_design and chosen is None:
+        drawn, points = evaluation_set(environment, goals, seed)
+        heading = f"{counted(goals, 'drawn body')}, one for each goal (seed {seed}):"
+        parts = [("drawn", heading, drawn, points), ("own", "the environment's own body:", None, single)]
     shown = environment.task_class.distance_scale.text
     results: list[dict[str, Any]] = []
     say = partial(click.echo, err=as_json)  # stdout is for the JSON
     say(f"{'agent':34s} {'backend':10s} {'success':>8s} {'mean':>11s} {'worst':>11s} {'return':>8s}")
-    for backend in backends or (environment.backend,):
-        for agent in agents:
-            outcome = run(agent, environment.on(backend), points, design=chosen, seed=seed, workers=workers)
-            results.append({"agent": agent, "backend": backend, **outcome.to_json()})
-            distances = (f"{shown(value, 3):>11s}" for value in (outcome.mean_distance, outcome.worst_distance))
-            rate, total = f"{outcome.success_rate:8.1%}", f"{outcome.mean_return:8.2f}"
-            say(f"{agent[-34:]:34s} {backend:10s} {rate} {' '.join(distances)} {total}")
+    for bodies, heading, designs, points in parts:
+        if heading:
+            say(heading)
+        for backend in backends or (environment.backend,):
+            for agent in agents:
+                outcome = run(agent, environment.on(backend), points, design=designs, seed=seed, workers=workers)
+                results.append({"agent": agent, "backend": backend, "bodies": bodies, **outcome.to_json()})
+                distances = (f"{shown(value, 3):>11s}" for value in (outcome.mean_distance, outcome.worst_distance))
+                rate, total = f"{outcome.success_rate:8.1%}", f"{outcome.mean_return:8.2f}"
+                say(f"{agent[-34:]:34s} {backend:10s} {rate} {' '.join(distances)} {total}")
     inputs = {"environment": environment.model_dump(mode="json"), "goals": goals, "seed": seed, "design": chosen}
-    document = {**inputs, **provenance(), "results": results}
+    document = {**inputs, "drawn_designs": drawn and [dict(body) for body in drawn], **provenance(), "results": results}
     if as_json:
         click.echo(json.dumps(document))
     if output is not None:

@@ -11,6 +11,7 @@ import click
 from softgym_envs.cli import options
 from softgym_envs.errors import ConfigError
 from softgym_envs.extras import require
+from softgym_envs.wording import counted
 
 FOLDER = Path("results/benchmark")
 
@@ -113,7 +114,7 @@ def run(
                 for method in methods:
                     found = runs.run(folder, name, method, judge, level, seed, listed, bodies)  # type: ignore[arg-type]
                     click.echo(
-                        f"{name} {method} {found.judge} seed {seed}: {found.bodies} bodies, "
+                        f"{name} {method} {found.judge} seed {seed}: {counted(found.bodies, 'body')}, "
                         f"{found.spent['cpu_seconds']:.1f} CPU s, best {', '.join(load_definition(name).score_names)}: "
                         f"{_scores(found.search_scores[:1])} (SI)"
                     )
@@ -162,7 +163,7 @@ def winners(names: tuple[str, ...], every: tuple[str, ...], rest: bool, store: b
                 f"{name} {row.method} seed {row.seed}: learned model {row.surrogate:.4g}, finite elements {exact}, "
                 f"exploitation {row.exploitation:.2g} (SI)"
             )
-        click.echo(f"{name}: Kendall's tau {module.rank_correlation(rows):.2f} over {len(rows)} winners")
+        click.echo(f"{name}: Kendall's tau {module.rank_correlation(rows):.2f} over {counted(len(rows), 'winner')}")
         if store:
             click.echo(f"wrote {module.store(rows)}")
 

@@ -10,6 +10,7 @@ import click
 
 from softgym_envs.cli import options
 from softgym_envs.extras import require
+from softgym_envs.wording import counted
 
 
 @click.command()
@@ -78,7 +79,7 @@ def sensitivity(config: Path, folder: Path | None, quiet: bool, overrides: tuple
         for variable, row in table.items():
             click.echo(f"  {variable:22s} " + " ".join(f"{row[key]:16.5g}" for key in keys))
     kept = f" ({100 * result.groups_kept:.0f} % of the sample groups remain usable)" if result.infeasible else ""
-    click.echo(f"\n{result.designs} designs, {result.infeasible} infeasible{kept}; wrote {folder}")
+    click.echo(f"\n{counted(result.designs, 'design')}, {result.infeasible} infeasible{kept}; wrote {folder}")
 
 
 @click.command()
@@ -101,7 +102,7 @@ def optimise(config: Path, folder: Path | None, quiet: bool, overrides: tuple[st
     if study.solver.method == "gradient":
         result = gradient.optimise(study, folder)
         click.echo(json.dumps(result.best.to_json(), indent=2))
-        click.echo(f"{len(result.descents)} descents, {result.seconds:.2f} s; wrote {folder}")
+        click.echo(f"{counted(len(result.descents), 'descent')}, {result.seconds:.2f} s; wrote {folder}")
         return
     with options.resumable():
         found = search(study, folder, progress=not quiet)
@@ -109,8 +110,8 @@ def optimise(config: Path, folder: Path | None, quiet: bool, overrides: tuple[st
     for row in ends:
         click.echo(json.dumps(row.to_json()))
     click.echo(
-        f"{len(found.front)} designs on the front of {found.feasible} feasible and {found.infeasible} infeasible "
-        f"designs; wrote {folder}"
+        f"{counted(len(found.front), 'design')} on the front of {found.feasible} feasible and "
+        f"{counted(found.infeasible, 'infeasible design')}; wrote {folder}"
     )
 
 

@@ -15,6 +15,7 @@ import click
 from softgym_envs.cli import options
 from softgym_envs.errors import ConfigError
 from softgym_envs.extras import require
+from softgym_envs.wording import counted
 
 if TYPE_CHECKING:
     from softgym_envs.agents.config import EnvironmentConfig
@@ -59,7 +60,7 @@ def list_(as_json: bool) -> None:
     width = max(map(len, ENVIRONMENTS))
     for identifier, row in ENVIRONMENTS.items():
         backend = f", backend {row.backend}" if row.backend else ""
-        steps = f"{row.max_episode_steps} steps"
+        steps = counted(row.max_episode_steps, "step")
         click.echo(f"  {identifier:{width}s}  robot {row.robot}, task {row.task}, {steps}{backend}")
     for title, table in tables.items():
         click.echo(f"{title}: {', '.join(table)}")
@@ -117,12 +118,13 @@ def rollout(
             doubts.append(int(info["doubt"]))
             if video is not None:
                 frames.append(env.render())
-    click.echo(f"{environment} on {config.backend}, agent {agent}: {step} steps, return {total:.2f}")
+    click.echo(f"{environment} on {config.backend}, agent {agent}: {counted(step, 'step')}, return {total:.2f}")
     scale = config.task_class.distance_scale
     click.echo(f"final {scale.name} {scale.text(info['distance'], 3)}, success {info['is_success']}")
     if doubted := [doubt for doubt in doubts if doubt]:
         reasons = doubt_text(functools.reduce(operator.or_, doubted))
-        click.echo(f"{len(doubted)} of {len(doubts)} states are not trusted: {reasons}; compare with --backend fem")
+        verb = "is" if len(doubted) == 1 else "are"
+        click.echo(f"{len(doubted)} of {len(doubts)} states {verb} not trusted: {reasons}; compare with --backend fem")
     if video is not None:
         write_video(video, frames, fps=env.metadata["render_fps"])
         click.echo(f"wrote {video}")
@@ -162,7 +164,8 @@ def record(
     config = _environment(environment, agent, backend, "record")
     chosen = options.design_of(design) or None
     dataset = record_episodes(name, agent, config, episodes=episodes, design=chosen, seed=seed)
-    click.echo(f"wrote {dataset.total_episodes} episodes, {dataset.total_steps} steps: minari.load_dataset('{name}')")
+    episodes_text, steps_text = counted(dataset.total_episodes, "episode"), counted(dataset.total_steps, "step")
+    click.echo(f"wrote {episodes_text}, {steps_text}: minari.load_dataset('{name}')")
 
 
 @click.command()

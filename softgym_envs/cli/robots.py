@@ -28,8 +28,8 @@ def show(robot: str, options_: tuple[str, ...], design: tuple[str, ...], picture
     chosen = options.design_of(design)
     model = body.build(chosen)
     mesh = body.body(chosen) if isinstance(body, MeshedRobot) else None
+    values = body.design_space.complete(chosen)
     if as_json:
-        values = body.design_space.complete(chosen)
         description = {
             "robot": robot,
             "weights_name": body.weights_name,
@@ -51,7 +51,7 @@ def show(robot: str, options_: tuple[str, ...], design: tuple[str, ...], picture
         for variable in body.design_space:
             unit = "" if variable.unit == "1" else f" {variable.unit}"
             bounds = f"[{variable.low:g}, {variable.high:g}]{unit}"
-            click.echo(f"  {variable.name:16s} {variable.baseline:<10g} {bounds:24s} {variable.description}")
+            click.echo(f"  {variable.name:16s} {values[variable.name]:<10g} {bounds:24s} {variable.description}")
         click.echo("\nactuators:")
         for actuator in body.actuators:
             click.echo(

@@ -10,6 +10,7 @@ import click
 
 from softgym_envs.cli import options
 from softgym_envs.errors import ConfigError
+from softgym_envs.wording import counted
 
 
 @click.command()
@@ -26,7 +27,8 @@ def dataset(config: Path, folder: Path, quiet: bool, overrides: tuple[str, ...])
     with options.resumable():
         data = generate_datasets(load_config(config, FitConfig, overrides), folder, progress=not quiet)
     for split, columns in data.items():
-        click.echo(f"{split}: {len(columns['rest'])} states of {int(columns['rest'].sum())} designs")
+        states, bodies = len(columns["rest"]), int(columns["rest"].sum())
+        click.echo(f"{split}: {counted(states, 'state')} of {counted(bodies, 'design')}")
 
 
 @click.command()

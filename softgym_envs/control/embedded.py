@@ -11,6 +11,7 @@ from softgym_envs.control.inverse_qp import InverseQP
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.solvers.complementarity import complementary_step
+from softgym_envs.wording import counted
 
 MAX_SETTLING_STEPS = 25
 SETTLED = 2.5e-4
@@ -63,7 +64,9 @@ class PICorrection:
             raise ValueError(f"goal must be finite coordinates, got {np.asarray(goal).tolist()}")
         measured = np.asarray(measured, dtype=float).ravel()
         if measured.shape != goal.shape or not np.isfinite(measured).all():
-            raise ValueError(f"measured effector must be {goal.size} finite coordinates, got {measured.tolist()}")
+            raise ValueError(
+                f"measured effector must be {counted(goal.size, 'finite coordinate')}, got {measured.tolist()}"
+            )
         error = goal - measured
         self._increment = self.integral * error
         self.correction = self._clamped(self.correction + self._increment)
@@ -168,7 +171,8 @@ class EmbeddedLoop:
                 raise ValueError("measured displacements are for loops that command efforts")
             if displacement.shape != self.command.shape or not np.isfinite(displacement).all():
                 raise ValueError(
-                    f"measured displacement must be {self.command.size} finite numbers, got {displacement.tolist()}"
+                    f"measured displacement must be {counted(self.command.size, 'finite number')}, got "
+                    f"{displacement.tolist()}"
                 )
             self.displacement = displacement
         condensed, slack = self._present()
@@ -178,6 +182,7 @@ class EmbeddedLoop:
         chosen = np.ones(goal.size, dtype=bool) if weights is None else weights > 0.0
         if closed is not None and measured is not None:
             seen = np.asarray(measured, dtype=float).ravel()
+            self.controller.check_near("measured effector", seen)
             aim = closed.correct(goal, np.where(chosen, seen, goal) if seen.shape == goal.shape else seen)
         try:
             self.command = self.controller.solve(condensed, aim, self.command, slack)

@@ -26,6 +26,7 @@ from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.frames import frame_rows, rotation_vector_matrix
 from softgym_envs.mechanics.solvers.complementarity import solve_complementarity
 from softgym_envs.robots.grippers import FingerRobot
+from softgym_envs.wording import counted
 
 #: Number of coordinates of a pose, and lever arm [m] by which norms convert rotations to displacements.
 POSE, ARM = 6, 0.03
@@ -330,7 +331,7 @@ class CoupledFingers:
         """
         command = np.asarray(command, dtype=float)
         if command.shape != (self.count,) or not np.isfinite(command).all():
-            raise ValueError(f"command must be {self.count} finite numbers, got {command.tolist()}")
+            raise ValueError(f"command must be {counted(self.count, 'finite number')}, got {command.tolist()}")
         if mode not in ("displacement", "effort"):
             raise ValueError(f"mode = {mode!r} is unknown; allowed: 'displacement', 'effort'")
         forced = mode == "effort"

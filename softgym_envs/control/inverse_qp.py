@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 
+from softgym_envs.backends.backend import check_command
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
+from softgym_envs.wording import counted
 
 if TYPE_CHECKING:
     from softgym_envs.robots.base import Robot
@@ -163,14 +165,19 @@ class InverseQP:
             (self.min_effort, self.max_effort, "effort"),
         ):
             if low.shape != (count,) or high.shape != (count,) or not (low <= high).all():
-                raise ValueError(f"bounds of {word} must be {count} pairs, low <= high, got {low} and {high}")
+                raise ValueError(
+                    f"bounds of {word} must be {counted(count, 'pair')}, low <= high, got {low} and {high}"
+                )
         self._proxqp = proxqp
+        self._robot: Robot | None = None
         self._qp: Any = None
         self._rows: list[Any] = []  # the solvers of `solve_batch`
 
     @classmethod
     def for_robot(cls, robot: Robot, **options: Any) -> Self:
         """Return the controller of a robot, with the ranges, rates and largest efforts of its actuators.
+
+        It refuses goals that are far from the robot, such as those in millimetres.
 
         Args:
             robot: the robot. The goal weights of a robot with one effector are its goal axes.
@@ -186,7 +193,9 @@ class InverseQP:
             "max_effort": largest,
             "goal_weights": None if len(robot.effectors) > 1 or np.all(robot.goal_axes) else robot.goal_axes,
         }
-        return cls(**{**arguments, **options})
+        made = cls(**{**arguments, **options})
+        made._robot = robot
+        return made
 
     @classmethod
     def by_efforts(cls, robot: Robot, largest: float, rate: float, **options: Any) -> Self:
@@ -233,22 +242,44 @@ class InverseQP:
         """Return goal (n_e,) and command (n_a,) as arrays.
 
         Raises:
-            ValueError: if goal, command or model has a wrong shape or is not finite.
+            ValueError: if goal, command or model has a wrong shape or is not finite, or if goal or command are far
+                beyond what the robot of `for_robot` can do.
         """
+        count = len(self.rates)
         goal = np.asarray(goal, dtype=float).ravel()
         command = np.asarray(command, dtype=float)
         delta, effort = condensed.delta, condensed.lambda_.a
         if goal.shape != delta.e.shape or not np.isfinite(goal).all():
-            raise ValueError(f"goal must be {delta.e.size} finite coordinates, got {goal.tolist()}")
+            raise ValueError(f"goal must be {counted(delta.e.size, 'finite coordinate')}, got {goal.tolist()}")
         if command.shape != self.rates.shape or effort.shape != self.rates.shape or not np.isfinite(command).all():
             raise ValueError(
-                f"command must be {len(self.rates)} finite numbers, got {command.tolist()} for {len(effort)} actuators"
+                f"command must be {counted(len(self.rates), 'finite number')}, got {command.tolist()} for "
+                f"{counted(len(effort), 'actuator')}"
             )
         if not (np.isfinite(condensed.compliance).all() and np.isfinite(delta.array).all()):
             raise ValueError("the condensed model contains values that are not finite")
         if self.goal_weights is not None and self.goal_weights.shape != goal.shape:
-            raise ValueError(f"goal_weights must be {goal.size} numbers, got {self.goal_weights.tolist()}")
+            raise ValueError(f"goal_weights must be {counted(goal.size, 'number')}, got {self.goal_weights.tolist()}")
+        self.check_near("goal", goal)
+        if self._robot is not None and len(self._robot.actuators) == count and not self.by_effort.any():
+            check_command(self._robot, command, "displacement")
         return goal, command
+
+    def check_near(self, name: str, goals: np.ndarray) -> None:
+        """Check that effector coordinates are near the robot of `for_robot`, where their weights are not zero.
+
+        Args:
+            name: what they are, for messages.
+            goals: one or more coordinates of all effectors [m], shape (..., n_e).
+
+        Raises:
+            ValueError: for points farther from the effector at rest than three times the robot's size.
+        """
+        robot = self._robot
+        if robot is not None and goals.shape[-1] == 3 * len(robot.effectors):
+            if self.goal_weights is not None:
+                goals = np.where(self.goal_weights > 0.0, goals, np.tile(robot.effector_rest, len(robot.effectors)))
+            robot.check_point(name, goals.reshape(-1, 3))
 
     def limits(
         self, condensed: CondensedModel, command: np.ndarray, slack: np.ndarray | None = None, size: float = 1.0
@@ -298,11 +329,14 @@ class InverseQP:
             slack: actuators that are slack, shape (n_a,); default none.
 
         Raises:
-            ValueError: if goal, command or model has a wrong shape or is not finite.
+            ValueError: if goal, command, slack or model has a wrong shape or is not finite, or if goal or command are
+                far beyond what the robot of `for_robot` can do.
             ConvergenceError: if ProxQP does not reach its tolerance, for example because no step within the rates
                 brings an effort back below ``max_effort``.
         """
         goal, command = self.checked(condensed, goal, command)
+        if slack is not None and np.shape(slack) != self.rates.shape:
+            raise ValueError(f"slack must have shape {self.rates.shape}, got {np.shape(slack)}")
         program = self._program(condensed, goal, command, slack)
         self._qp, found = self._solved(self._qp, program.arguments)
         if found is None:
@@ -324,10 +358,11 @@ class InverseQP:
             slack: actuators that are slack, shape (n, n_a); default none.
 
         Raises:
-            ValueError: if the models or goals are not finite.
+            ValueError: if the models or goals are not finite, or if a goal is far from the robot of `for_robot`.
         """
         if not all(np.isfinite(values).all() for values in (condensed.compliance, condensed.delta.array, goals)):
             raise ValueError("the condensed models or goals contain values that are not finite")
+        self.check_near("goal", goals)
         if len(self._rows) != len(commands):
             self._rows = [None] * len(commands)
         program = self._program(condensed, goals, commands, slack)

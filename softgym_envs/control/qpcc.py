@@ -17,6 +17,7 @@ import numpy as np
 
 from softgym_envs.control.inverse_qp import UNBOUNDED
 from softgym_envs.errors import ConvergenceError
+from softgym_envs.wording import counted
 
 _INEQUALITY, _EQUALITY = 0, 5
 # Exit codes of DAQP.
@@ -211,5 +212,7 @@ def solve_qpcc(
         sides = [(closed, opened | one), (closed | one, opened)]
         stack += sides if w[branch] < y[branch] else sides[::-1]
     if best is None:
-        raise ConvergenceError(f"no set of the {k} complementary pairs is feasible within {programs} programs")
+        raise ConvergenceError(
+            f"no set of the {k} complementary pairs is feasible within {counted(programs, 'program')}"
+        )
     return Optimum(best.z, best.value, best.closed, programs, not stack)

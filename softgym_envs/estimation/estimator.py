@@ -22,6 +22,8 @@ from softgym_envs.estimation.posterior import Gaussian, Posterior, most_probable
 from softgym_envs.estimation.readings import (
     Noise,
     Readings,
+    check_settings,
+    checked_command,
     checked_pressures,
     checked_readings,
     checked_volumes,
@@ -249,7 +251,7 @@ class Estimator:
     Raises:
         DesignError: for a malformed design.
         InfeasibleDesign: if the body cannot exist.
-        ValueError: if a touched point lies outside the body.
+        ValueError: if a touched point lies outside the body, or for a robot without sensors or settings out of bounds.
     """
 
     def __init__(
@@ -263,6 +265,7 @@ class Estimator:
         equilibria: int = 10,
         accuracy: float = 0.1,
     ) -> None:
+        check_settings(radius=radius, equilibria=equilibria, accuracy=accuracy)
         self.robot, self.design, self.radius = robot, design, radius
         self.noise = noise or Noise()
         self.equilibria, self.accuracy = equilibria, accuracy
@@ -283,6 +286,8 @@ class Estimator:
         self._counts = sizes.get("a", 0), sizes.get("e", 0), sizes.get("c", 0)
         n_a = self._counts[0]
         sensors = model.constraints["s"]
+        if not sensors and self.noise.effort is None:
+            raise ValueError(f"robot '{self.robot.name}' has no sensors: no cavities and no Noise(effort=...)")
         self.rest_volumes = np.array([c.rest_volume for c in sensors if isinstance(c, Cavity)])
         self._sealed = np.array([isinstance(c, SealedAir) for c in sensors], dtype=bool)
         self._rest = np.zeros(len(sensors))  # readings of the undeformed body; pressures are relative to ambient
@@ -304,7 +309,7 @@ class Estimator:
 
     def reading(self, command: np.ndarray, change: np.ndarray, efforts: np.ndarray | None = None) -> Readings:
         """Return the readings for values of the sensor rows of the condensed model, ``delta.s`` (n_s,)."""
-        values = self._rest + change
+        values = self._rest + checked_readings("change", change, len(self._rest))
         return Readings(command, values[~self._sealed], efforts, values[self._sealed])
 
     def forces(self, load: np.ndarray) -> np.ndarray:
@@ -345,7 +350,7 @@ class Estimator:
         """Return a reading together with those before it under the same command."""
         n_a = self._counts[0]
         assert self.belief is not None
-        command = checked_readings("command", readings.command, n_a)
+        command = checked_command(self.robot, readings.command)
         sealed = self._sealed
         cavities = np.zeros(len(sealed))
         cavities[~sealed] = checked_volumes(readings.volumes, self._rest[~sealed])

@@ -22,7 +22,15 @@ from softgym_envs.estimation.estimator import IMPROBABLE
 from softgym_envs.estimation.loads import Touch, cell_nodes
 from softgym_envs.estimation.places import Mixture, Moments, Places
 from softgym_envs.estimation.posterior import Gaussian
-from softgym_envs.estimation.readings import Noise, Readings, checked_readings, checked_volumes, explains
+from softgym_envs.estimation.readings import (
+    Noise,
+    Readings,
+    check_settings,
+    checked_command,
+    checked_readings,
+    checked_volumes,
+    explains,
+)
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.constraints.cavity import Cavity
 from softgym_envs.robots.base import Robot
@@ -154,6 +162,7 @@ class LearnedEstimator:
         steps: int = 5,
         accuracy: float = 0.2,
     ) -> None:
+        check_settings(steps=steps, accuracy=accuracy)
         self.robot, self.noise = robot, noise or Noise()
         self.steps, self.accuracy = steps, accuracy
         if self.noise.drift or self.noise.effort is not None:
@@ -192,7 +201,13 @@ class LearnedEstimator:
         self.touch(load)
 
     def touch(self, load: Touch | None) -> None:
-        """Replace the touch; the errors of actuators stay known."""
+        """Replace the touch; the errors of actuators stay known.
+
+        Raises:
+            ValueError: for another load than a touch, or a cell that its grid does not have.
+        """
+        if load is not None and not isinstance(load, Touch):
+            raise ValueError(f"load = {load!r} must be a Touch or None on a learned model; use Estimator")
         if self._known is not None and self._known.after is not None:
             self._actuators = _actuators_of(self._known.after)
         self.load = load
@@ -212,7 +227,7 @@ class LearnedEstimator:
 
     def reading(self, command: np.ndarray, change: np.ndarray) -> Readings:
         """Return the readings for values of the sensor rows of the condensed model, ``delta.s`` (n_s,)."""
-        return Readings(command, self.rest_volumes + change)
+        return Readings(command, self.rest_volumes + checked_readings("change", change, len(self.rest_volumes)))
 
     def update(self, readings: Readings) -> LearnedEstimate:
         """Return the estimate after one more reading.
@@ -223,7 +238,7 @@ class LearnedEstimator:
             ValueError: if readings have a wrong shape, are not finite (a lost sensor) or are impossible (a wrong unit).
             ConvergenceError: if the model finds no equilibrium.
         """
-        command = checked_readings("command", readings.command, self.model.count)
+        command = checked_command(self.robot, readings.command)
         volumes = checked_volumes(readings.volumes, self.rest_volumes) - self.rest_volumes
         known = self._known
         assert known is not None

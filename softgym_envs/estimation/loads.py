@@ -71,15 +71,18 @@ class TouchGrid:
         """Return the cell that contains a point of the undeformed surface [m] (3,).
 
         Raises:
-            ValueError: if the point is outside the grid.
+            ValueError: if the point is outside the grid, or farther from its plane than the pitch.
         """
         away = np.asarray(point) - np.array(self.corner)
+        height = float(away @ np.array(self.normal))
+        if not abs(height) <= self.pitch:
+            raise ValueError(f"point {np.asarray(point).tolist()} m is {height:g} m away from the plane of the grid")
         first, second = (int(np.floor(away @ np.array(axis) / self.pitch)) for axis in (self.along, self.across))
         return self.checked((first, second))
 
     def checked(self, cell: Cell) -> Cell:
         """Return a cell; a ValueError if the grid does not have it."""
-        if not all(0 <= k < n for k, n in zip(cell, self.cells, strict=True)):
+        if len(cell) != 2 or not all(k in range(n) for k, n in zip(cell, self.cells, strict=True)):
             raise ValueError(
                 f"touch in cell {tuple(cell)} is outside the model: the grid has {self.cells[0]} x {self.cells[1]} "
                 "cells, numbered from 0"

@@ -6,6 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from softgym_envs.backends.backend import check_command
+from softgym_envs.robots.base import Robot
+from softgym_envs.wording import counted
+
 MOST_GROWTH = 10.0
 """Largest volume of a cavity that a reading may tell, in volumes at rest; also largest pressure of its air over that at
 rest. Neither occurs in a soft body, but both do in readings of a wrong unit."""
@@ -66,12 +70,24 @@ def explains(residuals: np.ndarray) -> bool:
     return bool(residuals @ residuals <= LARGEST_RESIDUAL**2 * len(residuals))
 
 
+def check_settings(**settings: float) -> None:
+    """Raise ValueError for a setting of an estimator that is not positive and finite."""
+    for name, value in settings.items():
+        if not (np.isfinite(value) and value > 0):
+            raise ValueError(f"{name} = {value} must be positive and finite")
+
+
 def checked_readings(name: str, values: np.ndarray | None, count: int) -> np.ndarray:
     """Return values of one kind of reading as an array (count,), or a ValueError."""
     array = np.asarray([] if values is None else values, dtype=float)
     if array.shape != (count,) or not np.isfinite(array).all():
-        raise ValueError(f"readings '{name}' must be {count} finite values, got {array.tolist()}")
+        raise ValueError(f"readings '{name}' must be {counted(count, 'finite value')}, got {array.tolist()}")
     return array
+
+
+def checked_command(robot: Robot, values: np.ndarray) -> np.ndarray:
+    """Return commanded displacements (n_a,), or a ValueError for malformed ones and those of a wrong unit."""
+    return check_command(robot, checked_readings("command", values, len(robot.actuators)), "displacement")
 
 
 def checked_volumes(values: np.ndarray | None, rest: np.ndarray) -> np.ndarray:

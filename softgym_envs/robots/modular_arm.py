@@ -131,7 +131,7 @@ class ModularArm(Robot):
         if isinstance(cells, int) and not isinstance(cells, bool):
             if not 1 <= cells <= MOST_CELLS:
                 raise ValueError(f"cells = {cells} is out of bounds; allowed: 1 to {MOST_CELLS}")
-        elif isinstance(cells, str | bool) or not cells:
+        elif not isinstance(cells, Sequence) or isinstance(cells, str) or not cells:
             raise ValueError(f"cells must be a number or a list of names, got {cells!r}; allowed: {', '.join(CELLS)}")
         elif unknown := [cell for cell in cells if cell not in CELLS]:
             raise ValueError(unknown_name("cell", unknown[0], CELLS))
@@ -286,9 +286,9 @@ def _free_cells(count: int, kinds: Sequence[str]) -> Iterator[DesignVariable]:
             f"what the cell is: {', '.join(f'{k} from {place}' for place, k in enumerate(kinds))} (cell {number})"
         )
         bounds = 0.0, float(len(kinds))
-        yield DesignVariable(f"kind_{number}", *bounds, kind + 0.5, "-", described, choices=tuple(kinds))
+        yield DesignVariable(f"kind_{number}", *bounds, kind + 0.5, "1", described, choices=tuple(kinds))
         for name, dimension in zip(("length", "width", "depth"), SHAPES[module].dimensions, strict=True):
             low, high = box[dimension]
             share = (_typical(module, dimension) - low) / (high - low)
             described = f"{name} as a share of its range (cell {number})"
-            yield DesignVariable(f"{name}_{number}", 0.0, 1.0, share, "-", described)
+            yield DesignVariable(f"{name}_{number}", 0.0, 1.0, share, "1", described)

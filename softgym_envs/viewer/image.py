@@ -8,6 +8,7 @@ import numpy as np
 
 from softgym_envs.backends.backend import State
 from softgym_envs.backends.fem import FEMBackend
+from softgym_envs.envs.tasks.base import LENGTHS
 from softgym_envs.robots.base import Robot
 from softgym_envs.viewer.scene import STUB, Scene, check_display, obstacle_skins
 from softgym_envs.viewer.surface import BodySurface, ShapeFinder, cable_lines
@@ -84,7 +85,7 @@ class ImageRenderer:
         scene.set_ghost(None)
         scene.set_state(x, state)
         scene.set_goal(np.asarray(goal), np.asarray(path))
-        scene.set_text(text or f"distance {1e3 * float(np.linalg.norm(state.effector[0] - goal)):.1f} mm")
+        scene.set_text(text or f"distance {LENGTHS.text(float(np.linalg.norm(state.effector[0] - goal)))}")
         if self._window:
             scene.update()
         return scene.image()

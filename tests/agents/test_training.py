@@ -13,6 +13,7 @@ from safetensors import safe_open
 from softgym_envs.agents import training
 from softgym_envs.agents.config import EnvironmentConfig, TrainConfig
 from softgym_envs.agents.evaluation import evaluate, sample_goals
+from softgym_envs.agents.learners.cloning import CloningLearner
 from softgym_envs.agents.learners.sac import SACLearner
 from softgym_envs.agents.policy import Policy
 from softgym_envs.agents.training import train
@@ -197,6 +198,19 @@ def test_an_interrupted_extension_keeps_the_policy_and_ends_as_an_uninterrupted_
     assert [extension[key] for key in ("from_steps", "to_steps", "at_step")] == [200, 600, 200]
     with open(folder / "curve.csv") as stream:
         assert [int(row["step"]) for row in csv.DictReader(stream)] == [200, 400, 600]
+
+
+def test_a_training_that_other_code_continues_says_so(tmp_path, capfd):
+    config = CONFIG.model_copy(update={"learner": "cloning", "steps": 16, "report_every": 8})
+    with interrupted_at(CloningLearner, 8):
+        train(config, tmp_path, progress=False)
+    path = tmp_path / "provenance.json"
+    begun = json.loads(path.read_text())
+    begun["versions"]["softgym-envs"] = "0.0.1"
+    path.write_text(json.dumps(begun))
+    policy = train(config, tmp_path)
+    assert capfd.readouterr().out.count("was begun with softgym-envs 0.0.1; continued with softgym-envs ") == 1
+    assert len(Policy(policy).card["continued"]) == 1
 
 
 def test_an_extension_with_too_many_steps_is_shortened(tmp_path):

@@ -314,7 +314,7 @@ def test_a_body_that_fails_never_wins(written):
     assert snapshot.winner.role == "baseline" and snapshot.refinements == []
     results = collect(snapshot)
     titles = {finding.title: finding.text for finding in findings(snapshot, results)}
-    assert "They cannot win. Trial 1: goal 2 of 6: no equilibrium." in titles["1 of 2 bodies fail on FEM"]
+    assert "It cannot win. Trial 1: goal 2 of 6: no equilibrium." in titles["1 of 2 bodies fails on FEM"]
     test = snapshot.folder.path / "finalists" / "trial0000-qp-fem-unseen.json"
     FinalistTest(0, "qp", "fem", "unseen", error="goal 1 of 6: lost").write(test)
     assert (

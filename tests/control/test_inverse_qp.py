@@ -7,7 +7,7 @@ import pytest
 
 from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
-from softgym_envs.control import InverseQP
+from softgym_envs.control import ContactQP, EmbeddedLoop, InverseQP, PICorrection
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.solvers.complementarity import solve_complementarity
@@ -395,6 +395,41 @@ def test_a_broken_model_is_an_error_not_a_command(linear):
 def test_rates_must_be_positive(rates):
     with pytest.raises(ValueError, match="rates must be positive"):
         InverseQP(np.zeros(3), np.ones(3), np.array(rates), np.ones(3, dtype=bool))
+
+
+@pytest.mark.parametrize("kind", [InverseQP, ContactQP])
+def test_a_goal_in_millimetres_is_refused_by_the_controller_of_a_robot(kind):
+    robot = make_robot("finger")
+    state = FEMBackend(robot).reset()
+    controller = kind.for_robot(robot)
+    goal = state.effector[0] + [0.0, 0.0, 0.005]
+    assert controller.solve(state.condensed, goal, state.command).any()
+    with pytest.raises(ValueError, match=r"m away from the effector of robot 'finger', .* did you mean metres\?"):
+        controller.solve(state.condensed, 1e3 * goal, state.command)
+    loop = EmbeddedLoop(lambda displacement: state.condensed, controller)
+    with pytest.raises(ValueError, match="did you mean metres"):
+        loop.step(1e3 * goal)
+    with pytest.raises(ValueError, match=r"command = 5 m of actuator 'cable_1' is far beyond its range .* its unit"):
+        controller.solve(state.condensed, goal, [5.0, 0.0])
+    closed = EmbeddedLoop(lambda displacement: state.condensed, controller, PICorrection())
+    with pytest.raises(ValueError, match=r"measured effector = .* did you mean metres"):
+        closed.step(goal, 1e3 * goal)
+    if kind is InverseQP:
+        with pytest.raises(ValueError, match=r"slack must have shape \(2,\), got \(3,\)"):
+            controller.solve(state.condensed, goal, state.command, [True] * 3)
+    # A coordinate without a weight is free.
+    kind.for_robot(robot, goal_weights=[1.0, 0.0, 1.0]).solve(state.condensed, goal + [0.0, 9.0, 0.0], state.command)
+
+
+def test_a_goal_in_millimetres_is_refused_in_a_batch():
+    robot = make_robot("finger")
+    state = FEMBackend(robot).reset()
+    parts = (np.stack([getattr(state.condensed, name)] * 2) for name in ("compliance", "free", "effort"))
+    batch, goals = CondensedModel(*parts, state.condensed.roles), np.stack([state.effector[0]] * 2)
+    controller, commands = InverseQP.for_robot(robot), np.stack([state.command] * 2)
+    assert controller.solve_batch(batch, goals, commands).shape == commands.shape
+    with pytest.raises(ValueError, match="did you mean metres"):
+        controller.solve_batch(batch, goals * [[1.0], [1e3]], commands)
 
 
 # -- on the finite elements -----------------------------------------------------------------------------------------

@@ -269,3 +269,23 @@ def test_tip_of_an_uncertain_force_lies_on_a_curve(monkeypatch):
     monkeypatch.setattr(Estimator, "_bend", lambda *given: None)
     straight = misfit()
     assert curved < 3.0 < straight  # of the mean of three squares
+
+
+def test_wrong_inputs_name_themselves():
+    robot = make_robot("sensorized_finger", cavities=2)
+    estimator = Estimator(robot)
+    rest = np.zeros(2)
+    with pytest.raises(ValueError, match=r"command = 6 m of actuator .* is far beyond its range .* check its unit"):
+        estimator.update(estimator.reading(np.array([6.0]), rest))  # millimetres
+    with pytest.raises(ValueError, match=r"readings 'change' must be 2 finite values, got \[0.0, 0.0, 0.0\]"):
+        estimator.reading(np.array([0.006]), np.zeros(3))
+    with pytest.raises(ValueError, match="equilibria = 0 must be positive"):
+        Estimator(robot, equilibria=0)
+    with pytest.raises(ValueError, match="radius = -1.0 must be positive"):
+        Estimator(robot, radius=-1.0)
+    with pytest.raises(ValueError, match=r"robot 'finger' has no sensors: no cavities and no Noise\(effort="):
+        Estimator(make_robot("finger"))
+    with pytest.raises(ValueError, match="0.02 m away from the plane of the grid"):
+        GRID.cell(np.array([0.0, 0.02, -0.016]))
+    with pytest.raises(ValueError, match=r"touch in cell \(1.5, 2\) is outside the model"):
+        estimator.touch(Touch(GRID, (1.5, 2)))

@@ -10,7 +10,7 @@ import pytest
 from softgym_envs import make_robot
 from softgym_envs.backends.backend import PointForce
 from softgym_envs.backends.surrogate import SurrogateBackend
-from softgym_envs.estimation import Noise, Readings, Touch, finger_grid
+from softgym_envs.estimation import Noise, Payload, Readings, Touch, finger_grid
 from softgym_envs.estimation.learned import LearnedEstimator
 from softgym_envs.estimation.model_errors import measured_errors
 from softgym_envs.estimation.readings import LARGEST_RESIDUAL
@@ -220,3 +220,15 @@ def test_wrong_inputs_are_named(robot):
         touched(robot).update(Readings(COMMAND, np.array([1.0])))
     with pytest.raises(ValueError, match="errors must have 5 rows"):
         LearnedEstimator(robot, errors=RowErrors.none(4))
+
+
+def test_wrong_inputs_name_themselves(robot):
+    estimator = LearnedEstimator(robot)
+    with pytest.raises(ValueError, match=r"command = 6 m of actuator .* is far beyond its range .* check its unit"):
+        estimator.update(estimator.reading(np.array([6.0]), np.zeros(2)))  # millimetres
+    with pytest.raises(ValueError, match="readings 'change' must be 2 finite values"):
+        estimator.reading(np.array([0.006]), np.zeros(3))
+    with pytest.raises(ValueError, match="must be a Touch or None on a learned model; use Estimator"):
+        estimator.touch(Payload())
+    with pytest.raises(ValueError, match="steps = 0 must be positive"):
+        LearnedEstimator(robot, steps=0)

@@ -137,6 +137,7 @@ def test_cells_are_an_option_and_their_dimensions_the_design():
         ({"cells": []}, "list of names"),
         ({"cells": True}, "list of names"),
         ({"cells": 13}, "cells = 13 is out of bounds; allowed: 1 to 12"),
+        ({"cells": 2.5}, "cells must be a number or a list of names, got 2.5"),
         ({"body": "fem"}, "'fem'"),
         ({"cells": 2, "kinds": ["leaf"]}, "unknown kind 'leaf'"),
         ({"cells": 2, "kinds": []}, "kinds must be a list of names"),
@@ -145,6 +146,14 @@ def test_cells_are_an_option_and_their_dimensions_the_design():
 def test_wrong_options_of_the_arm_are_named(options, message):
     with pytest.raises(ValueError, match=message):
         make_robot("modular_arm", **options)
+
+
+def test_shares_and_choices_have_no_unit():
+    arm = make_robot("modular_arm", cells=2)
+    with pytest.raises(DesignError, match=r"'kind_1' = 7 is out of bounds; allowed: 0 to 4$"):
+        arm.design_space.complete({"kind_1": 7})
+    with pytest.raises(DesignError, match=r"'length_1' = 2 is out of bounds; allowed: 0 to 1$"):
+        arm.design_space.complete({"length_1": 2})
 
 
 def test_the_structure_may_be_part_of_the_design():

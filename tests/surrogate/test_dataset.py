@@ -364,7 +364,7 @@ def test_manifest_and_card(made):
     assert manifest["columns"]["displacement"] == ["cable_1", "cable_2"]
     assert manifest["plan"]["sequence"] == "halton"
     card = (folder / "README.md").read_text()
-    assert card.startswith("# States of robot `finger`\n\n16 equilibria of 4 bodies, by `softgym dataset`")
+    assert card.startswith("# States of robot `finger`\n\n16 states of 4 bodies, by `softgym dataset`")
     assert "0 bodies are infeasible or have no equilibrium at rest, 0 commands have no equilibrium" in card
     column = data["effector"][:, 1]
     assert f"| effector: tip y | 16 | {column.min():.6g} | {column.max():.6g} |" in card
@@ -537,7 +537,7 @@ def test_infeasible_designs_are_counted(tmp_path, monkeypatch, trunk):
     assert data["rest"].sum() == 1
     np.testing.assert_array_equal(data["effector"], trunk[1]["effector"][4:8])
     card = (tmp_path / "one" / "README.md").read_text()
-    assert "4 equilibria of 1 bodies" in card and "3 bodies are infeasible" in card
+    assert "4 states of 1 body," in card and "3 bodies without a mesh" in card
     monkeypatch.setattr(dataset, "sample_group", lambda robot, plan, group: (None, plan.states))
     with pytest.raises(DataError, match="no design of dataset '.*none' is feasible"):
         generate_dataset(tmp_path / "none", "trunk", PLAN, groups_per_shard=2, progress=False)

@@ -20,6 +20,7 @@ from softgym_envs.surrogate.export.common import exportable
 from softgym_envs.surrogate.model import SurrogateModel
 from softgym_envs.surrogate.potential.model import Model
 from softgym_envs.version import __version__
+from softgym_envs.wording import counted
 
 _HERE = Path(__file__).parent
 _UNBOUNDED = 1e30
@@ -134,7 +135,9 @@ def export_controller_c(
     potential, robot = exportable(model, members), robot or model.robot
     controller = InverseQP.for_robot(robot) if controller is None else controller
     if len(controller.rates) != potential.count:
-        raise ValueError(f"the controller has {len(controller.rates)} actuators, the model {potential.count}")
+        raise ValueError(
+            f"the controller has {counted(len(controller.rates), 'actuator')}, the model {potential.count}"
+        )
     if controller.by_effort.any() != controller.by_effort.all():
         raise ValueError("the controller commands displacements and efforts; allowed: one quantity for all actuators")
     drive = "effort" if controller.by_effort.all() else "displacement"

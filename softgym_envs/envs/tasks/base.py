@@ -14,6 +14,7 @@ import numpy as np
 from softgym_envs.backends.backend import PointForce, State
 from softgym_envs.envs.arrays import Array, namespace, pick_rows
 from softgym_envs.robots.base import Robot
+from softgym_envs.wording import decimal
 
 Kinematics = Callable[[Array], Array]
 """Maps commands (B, n_a) to the effectors that they lead to [m], shape (B, 3), for the present bodies."""
@@ -44,8 +45,8 @@ class DistanceScale:
     factor: float
 
     def text(self, distance: float, digits: int = 1) -> str:
-        """Return a distance with its unit: ``"3.2 mm"``."""
-        return f"{self.factor * distance:.{digits}f} {self.unit}"
+        """Return a distance with its unit: ``"3.2 mm"``, or two significant digits if it is small: ``"0.028 mm"``."""
+        return f"{decimal(self.factor * distance, digits)} {self.unit}"
 
     def limit_text(self, distance: float) -> str:
         """Return a distance that somebody chose, without needless zeros: ``"5 mm"``."""

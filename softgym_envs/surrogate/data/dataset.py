@@ -16,6 +16,7 @@ from softgym_envs.robots.registry import make_robot
 from softgym_envs.storage import atomic_write, read_npz, write_json
 from softgym_envs.surrogate.data.sampling import SamplingPlan, sample_group
 from softgym_envs.version import __version__
+from softgym_envs.wording import counted
 
 if TYPE_CHECKING:
     from filelock import AcquireReturnProxy
@@ -201,9 +202,9 @@ def _write_card(path: Path, manifest: dict[str, Any], data: dict[str, np.ndarray
     lines = [
         f"# States of robot `{manifest['robot']}`",
         "",
-        f"{len(data['rest'])} equilibria of {int(data['rest'].sum())} bodies, by `softgym dataset` "
-        f"(softgym-envs {__version__}). {infeasible} bodies are infeasible or have no equilibrium at rest, {failed} "
-        "commands have no equilibrium; both are left out.",
+        f"{counted(len(data['rest']), 'state')} of {counted(int(data['rest'].sum()), 'body')}, by `softgym dataset` "
+        f"(softgym-envs {__version__}). Left out: {counted(infeasible, 'body')} without a mesh or without an "
+        f"equilibrium at rest, and {counted(failed, 'command')} without an equilibrium.",
         "",
         f"Robot options: `{json.dumps(manifest['robot_options'])}`. Plan: `{json.dumps(manifest['plan'])}`.",
         "",
