@@ -83,7 +83,7 @@ def _mesh(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:
     measure, mesh, own = snapshot.config.distance, coarse.distance_mesh, "the mesh of the study"
     kinds = f", half of them missed by the baseline on {own}," if finer.choose == "missed" else ""
     text = (
-        f"At {fine.goals} goals{kinds} the change is {measure.text(fine.distance_change, '+')} there, and "
+        f"At {fine.goals} goals{kinds} the change is {measure.text(fine.distance_change, '+')} on the finer mesh and "
         f"{measure.text(mesh.before, '+')} on {own}. "
     )
     if mesh.interval is None:
@@ -142,8 +142,7 @@ def _bounds(results: StudyResults) -> Finding | None:
     return Finding(
         f"{len(ended)} of {count} variables at a limit",
         f"The winner has its {' and its '.join(parts)}. A better body may lie beyond. If it can be made, widen the "
-        "range: for a dimension in the robot's design space, whose surrogate is then fitted anew; for an option under "
-        "ranges.",
+        "range: of a dimension in the robot's design space, then fit its surrogate anew; of an option under ranges.",
     )
 
 
