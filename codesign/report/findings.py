@@ -61,9 +61,12 @@ def _goals(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:
             f"All {row.goals} goals on FEM, with a final {scale.name} of at most {limit}.",
             warns=False,
         )
-    worst = f"The largest {scale.name} is {scale.text(row.winner.worst_distance, 2)}."
+    reached = {group.key: group.mean.successes >= 0.5 for group in snapshot.unseen_tests}
+    before, after = (reached[body.trial, row.agent, "fem"] for body in (results.baseline, results.winner) if body)
+    lost = int((before & ~after).sum())
     title = f"{missed} of {row.goals} test goals are not reached"
-    return Finding(title, f"A goal is reached with a final {scale.name} of at most {limit}. {worst}")
+    text = f"The largest {scale.name} is {scale.text(row.winner.worst_distance, 2)}; a goal is reached within {limit}."
+    return Finding(title, f"{text} The baseline reaches {lost} of them." if lost else text)
 
 
 def _mesh(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:

@@ -130,7 +130,8 @@ def key_figures(snapshot: StudySnapshot, results: StudyResults) -> list[KeyFigur
     if transfer and transfer[0].spearman is not None:
         label = f"rank correlation of surrogate and FEM, {len(transfer[0].trials)} bodies"
         add(f"{transfer[0].spearman:.2f}", label)
-    add(time_text(sum(results.cost.cpu_seconds.values())), f"CPU time for {results.bodies} bodies")
+    tested = " and the final test" if results.cost.cpu_seconds.get("finalists") else ""
+    add(time_text(sum(results.cost.cpu_seconds.values())), f"CPU time for {results.bodies} bodies{tested}")
     return figures
 
 
@@ -211,8 +212,8 @@ def _tested(snapshot: StudySnapshot) -> str:
     text = "FEM in the test"
     if finalists.test == "ends":
         text += (
-            ", where episodes end: from the command at which an episode on the surrogate ends the inverse QP settles, "
-            f"and a policy takes {finalists.last_steps} more steps"
+            ", where episodes end: from the last command of an episode on the surrogate, the inverse QP goes on until "
+            f"it settles, a policy for {finalists.last_steps} steps"
         )
     if (finer := finalists.refinement) is not None:
         options = ", ".join(f"{name} = {value}" for name, value in finer.robot_options.items())
