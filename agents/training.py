@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
 
 EVALUATION_SEED = 1_000_003
+"""Seed of the bodies and goals of all learning curves, far from the seeds of trainings."""
 
 POLICY = "policy.safetensors"
 LATEST = "latest.safetensors"

@@ -76,9 +76,12 @@ def _goals(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:
             f"{counted(row.goals, 'goal')} on FEM, each with a final {scale.name} of at most {limit}.",
             warns=False,
         )
-    worst = f"The largest {scale.name} is {scale.text(row.winner.worst_distance, 2)}."
+    reached = {group.key: group.mean.successes >= 0.5 for group in snapshot.unseen_tests}
+    before, after = (reached[body.trial, row.agent, "fem"] for body in (results.baseline, results.winner) if body)
+    lost = int((before & ~after).sum())
     title = f"{missed} of {counted(row.goals, 'test goal')} {'is' if missed == 1 else 'are'} not reached"
-    return Finding(title, f"A goal is reached with a final {scale.name} of at most {limit}. {worst}")
+    text = f"The largest {scale.name} is {scale.text(row.winner.worst_distance, 2)}; a goal is reached within {limit}."
+    return Finding(title, f"{text} The baseline reaches {lost} of them." if lost else text)
 
 
 def _mesh(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:
@@ -98,8 +101,8 @@ def _mesh(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:
     measure, mesh, own = snapshot.config.distance, coarse.distance_mesh, "the mesh of the study"
     kinds = f", half of them missed by the baseline on {own}," if finer.choose == "missed" else ""
     text = (
-        f"At {counted(fine.goals, 'goal')}{kinds} the change is {measure.text(fine.distance_change, '+')} there, and "
-        f"{measure.text(mesh.before, '+')} on {own}. "
+        f"At {counted(fine.goals, 'goal')}{kinds} the change is {measure.text(fine.distance_change, '+')} on the finer "
+        f"mesh and {measure.text(mesh.before, '+')} on {own}. "
     )
     if mesh.interval is None:
         return Finding("A finer mesh was tested", f"{text}With fewer than {MIN_GOALS} goals there is no interval.")
@@ -160,8 +163,7 @@ def _bounds(results: StudyResults) -> Finding | None:
     return Finding(
         f"{len(ended)} of {counted(count, 'variable')} at a limit",
         f"The winner has its {' and its '.join(parts)}. A better body may lie beyond. If it can be made, widen the "
-        "range: for a dimension in the robot's design space, whose surrogate is then fitted anew; for an option under "
-        "ranges.",
+        "range: of a dimension in the robot's design space, then fit its surrogate anew; of an option under ranges.",
     )
 
 

@@ -266,8 +266,10 @@ def transfer(snapshot: StudySnapshot, results: StudyResults) -> str | None:
                 points = (np.array(values) * objective.scale for values in (row.surrogate, row.fem))
                 ax.scatter(*points, s=48, c=colours, marker=marker, edgecolors="#334155", linewidths=0.6, zorder=3)
                 ax.scatter([], [], s=40, c="white", marker=marker, edgecolors="#334155", label=label)
+            shown = {roles.get(number, "other finalist") for row in rows for number in row.trials}
             for colour, label in ((WINNER, "winner"), (BASELINE, "baseline"), (OTHER, "other finalist")):
-                ax.scatter([], [], s=40, c=colour, marker="o", label=label)
+                if label in shown:
+                    ax.scatter([], [], s=40, c=colour, marker="o", label=label)
             ax.set(xlabel=f"surrogate: {objective.axis_inside}", ylabel=f"FEM: {objective.axis_inside}")
             ax.set(xlim=ends, ylim=ends, aspect="equal")
         axes[-1].legend(fontsize=8, loc="center left", bbox_to_anchor=(1.02, 0.5))

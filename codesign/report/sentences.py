@@ -132,7 +132,9 @@ def key_figures(snapshot: StudySnapshot, results: StudyResults) -> list[KeyFigur
     if transfer and transfer[0].spearman is not None:
         label = f"rank correlation of surrogate and FEM, {counted(len(transfer[0].trials), 'body')}"
         add(f"{transfer[0].spearman:.2f}", label)
-    add(time_text(sum(results.cost.cpu_seconds.values())), f"CPU time for {counted(results.bodies, 'body')}")
+    tested = " and the final test" if results.cost.cpu_seconds.get("finalists") else ""
+    spent = time_text(sum(results.cost.cpu_seconds.values()))
+    add(spent, f"CPU time for {counted(results.bodies, 'body')}{tested}")
     return figures
 
 
@@ -216,8 +218,8 @@ def _tested(snapshot: StudySnapshot) -> str:
     text = "FEM in the test"
     if finalists.test == "ends":
         text += (
-            ", where episodes end: from the command at which an episode on the surrogate ends the inverse QP settles, "
-            f"and a policy takes {counted(finalists.last_steps, 'more step')}"
+            ", where episodes end: from the last command of an episode on the surrogate, the inverse QP goes on until "
+            f"it settles, a policy for {counted(finalists.last_steps, 'step')}"
         )
     if (finer := finalists.refinement) is not None:
         options = ", ".join(f"{name} = {value}" for name, value in finer.robot_options.items())

@@ -55,9 +55,18 @@ def main(names: list[str]) -> None:
     for name in names or CLIENTS:
         requirement, script, *arguments = CLIENTS[name]
         python = python_of(name, requirement)
-        result = subprocess.run([python, FOLDER / script, *arguments], cwd=BUILD, stdout=subprocess.DEVNULL)
+        # Clients log progress, which only helps where one fails.
+        result = subprocess.run(
+            [python, FOLDER / script, *arguments],
+            cwd=BUILD,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
         print(f"{name:20s} {'ok' if result.returncode == 0 else 'FAILED'}", flush=True)
-        failed += [name] * (result.returncode != 0)
+        if result.returncode != 0:
+            failed.append(name)
+            print(result.stderr, file=sys.stderr)
     sys.exit(f"failed: {', '.join(failed)}" if failed else 0)
 
 

@@ -126,11 +126,6 @@ class FEMBackend(Backend):
         return self.state
 
     def touch(self, load: PointForce | None) -> None:
-        """Touch the body at a point from the next `step` on, or no longer; `reset` ends a touch.
-
-        Raises:
-            ValueError: for a point outside the body.
-        """
         loads = self._own_loads.copy()
         if load is not None:
             at = self.model.embed(load.point, radius=TOUCH_RADIUS)

@@ -95,7 +95,7 @@ def main() -> None:
 
 
 def _described(error: Exception) -> str:
-    """Return the message of an error; of one of the file system, the file and the reason."""
+    """Return the message of an error; for an error of the file system, the file and the reason."""
     if not isinstance(error, OSError) or error.strerror is None:
         return str(error)
     if error.filename is None:

@@ -181,7 +181,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
 
     @property
     def path(self) -> np.ndarray:
-        """All goals of the episode [m], shape (p, 3)."""
+        """All goals of the episode [m, or the unit of the task's goals], shape (p, 3)."""
         return self._path
 
     def reset(

@@ -30,7 +30,7 @@ F = TypeVar("F", bound=Callable[..., None])
 Drawing = tuple[Callable[..., None], dict]
 """A module-level function that draws one volume with gmsh in millimetres, and its parameters (JSON-serialisable)."""
 
-LARGEST = 10.0
+MAX_LENGTH = 10.0
 """Largest allowed robot, stroke or dimension [m]; larger ones were probably given in millimetres."""
 
 PUBLISHED = "published"
@@ -418,7 +418,7 @@ class Robot(ABC):
         bounded += [(v.name, v.high, v.unit) for v in self.design_space]
         lengths |= {f"high of '{name}'": high for name, high, unit in bounded if unit == "m"}
         for label, length in lengths.items():
-            if length > LARGEST:
+            if length > MAX_LENGTH:
                 raise ValueError(f"robot '{self.name}': {label} = {length:g} m; did you mean {1e-3 * length:g} m?")
 
 

@@ -56,7 +56,6 @@ FINGER_MESHES = {
 """Meshes of the fingers. No source states the radius of the cables' channels; with less than 1 mm, cables cut through
 the fine meshes before the end of their range, and from 1 to 1.5 mm efforts hardly change."""
 
-
 WIDE_BOXES = {
     1: {"length": (0.028, 0.052), "height": (0.0195, 0.027), "joint_height": (0.0042, 0.008)},
     2: {"length": (0.037, 0.052), "height": (0.017, 0.022), "joint_height": (0.0042, 0.008)},

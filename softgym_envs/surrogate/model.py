@@ -235,9 +235,6 @@ class SurrogateModel(ABC):
         Returns:
             Displacements (B, n_a), efforts (B, n_a), and whether they were found (B,).
         """
-        return self._search(context, target, guess, unilateral, tolerance, iterations)
-
-    def _search(self, context, target, guess, unilateral, tolerance, iterations):
         displacement, effort = guess.copy(), self.effort(context, guess)
         converged = np.isfinite(effort).all(axis=1)
         rows = np.flatnonzero((unilateral & ((effort < 0.0) | (guess > target))).any(axis=1))

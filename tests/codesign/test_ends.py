@@ -260,7 +260,7 @@ def test_a_report_has_the_part_of_the_mesh(written, ratio, left):
     assert results.winner.trial == 1
     texts = {finding.title: finding.text for finding in findings(snapshot, results)}
     titles = list(texts)
-    assert any("2 goals the change is -3.00 mm there, and -4.00 mm on" in text for text in texts.values())
+    assert any("2 goals the change is -3.00 mm on the finer mesh and -4.00 mm on" in text for text in texts.values())
     assert ("A finer mesh agrees" in titles) == (left < 4e-3)
     assert ("With the mesh's error, the gain is not certain" in titles) == (left >= 4e-3)
 

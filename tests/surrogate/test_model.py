@@ -156,7 +156,7 @@ def test_search_of_a_batch_equals_the_search_of_each_row(name):
     well = np.setdiff1d(np.arange(count), lost)
     assert found[2][well].all()
     # the same search in plain numpy
-    expected = SurrogateModel._search(model, context.rows(well), target[well], guess[well], unilateral, 2e-4, 12)
+    expected = SurrogateModel.search(model, context.rows(well), target[well], guess[well], unilateral, 2e-4, 12)
     assert expected[2].all()
     assert np.abs(found[0][well] - expected[0]).max() < 1e-4 * model.span.max()
     assert np.abs(found[1][well] - expected[1]).max() < 1e-3 * np.abs(expected[1]).max()

@@ -17,17 +17,18 @@ from softgym_envs.mechanics.solvers.complementarity import solve_row
 from softgym_envs.mechanics.solvers.equilibrium import CAUTIOUS
 
 MAX_ITERATIONS, MAX_SEARCHES = 20, 30
-"""Newton iterations with whole steps, and with shortened ones, after which they fail."""
+"""Largest numbers of Newton iterations with whole steps, and with shortened ones in an increment."""
 SHORTEST, SMALLEST_INCREMENT = 1e-3, 0.25
-"""Smallest part of a step of Newton's method, and of the way to a target within one time step."""
+"""Smallest part of a Newton step, and of the way to a target within one time step."""
 SLOW, STEEP = 0.1, 0.75
-"""After a step longer than this part of the last one the factor is renewed; or in dynamics the step is not taken."""
+"""Length of a step over that of the last one. Above ``SLOW`` the factor is renewed after the step; above ``STEEP``, in
+dynamics, it is renewed in place of the step."""
 LONG, LONG_IN_TIME, TOO_LONG = 0.01, 0.002, 1.0
-"""After steps that turn a frame by more [rad], or move it as far, the factor is renewed, in statics and in dynamics; or
-the general solver takes over."""
+"""Length of a step: the largest turn of a frame [rad], or a motion as long. Above ``LONG``, in dynamics above
+``LONG_IN_TIME``, the factor is renewed after the step; above ``TOO_LONG`` the general solver takes over."""
 REMAINING, SMALLEST = 0.01, 1e-13
-"""The next step must be shorter than this part of the tolerance, or than this length [m], which is near rounding.
-Errors of a time step act on the next one through the velocities."""
+"""A solution is found when the next step will be shorter than this part of the tolerance, or than this length [m],
+which is near rounding. Errors of a time step act on the next one through the velocities."""
 
 
 class Factor(NamedTuple):

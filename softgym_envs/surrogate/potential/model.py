@@ -37,6 +37,9 @@ from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.model import Context, SurrogateModel
 from softgym_envs.surrogate.potential import kernels
 
+SHIFT = 4.0
+"""Subtracted from the factors of the energy's ramps before they are made positive, so that untrained ones are small."""
+
 
 def coefficient_sizes(n: int, e: int, w: int) -> dict[str, int]:
     """Names and sizes of the coefficients of a body, in the order in which the design layers return them.
@@ -84,7 +87,7 @@ class Model(SurrogateModel):
         self.tensors = tensors
         self.members, self.width = tensors["energy1"].shape[:2]
 
-        def kernel(name, *axes):
+        def kernel(name: str, *axes: int) -> np.ndarray:
             return np.ascontiguousarray(np.transpose(tensors[name], axes), dtype=np.float32)
 
         self.passive = self.effectors + self.sensors
@@ -104,10 +107,9 @@ class Model(SurrogateModel):
         self._held = kernel("held", 0, 2, 1)
         layers = [(tensors[f"body.{k}.weight"], tensors[f"body.{k}.bias"]) for k in range(3)]
         self._layers = [(w.astype(np.float32), v.astype(np.float32)[:, None]) for w, v in layers]
-        rest = tensors["rest"].astype(np.float32) if "rest" in tensors else None
-        self._rest = rest
-        if rest is not None and rest.shape != (self.count,):
-            raise ValueError(f"'rest' has shape {rest.shape}; the robot has {self.count} actuators")
+        self._rest = tensors["rest"].astype(np.float32) if "rest" in tensors else None
+        if self._rest is not None and self._rest.shape != (self.count,):
+            raise ValueError(f"'rest' has shape {self._rest.shape}; the robot has {self.count} actuators")
 
     def _prepare(self, design: np.ndarray) -> dict[str, np.ndarray]:
         rows, n, e, w, M = len(design), self.count, self.passive, self.width, self.members
@@ -121,7 +123,7 @@ class Model(SurrogateModel):
         parts = np.split(h.transpose(1, 0, 2), np.cumsum(list(sizes.values()))[:-1], axis=2)
         body = {k: np.ascontiguousarray(v) for k, v in zip(sizes, parts, strict=True)}
         for name in ("a", "b"):
-            body[name] = np.logaddexp(np.float32(0.0), body[name] - np.float32(4.0))
+            body[name] = np.logaddexp(np.float32(0.0), body[name] - np.float32(SHIFT))
         lower = np.tril_indices(n)
         factor, entries = np.zeros((rows, M, n, n), dtype=np.float32), body["quadratic"]
         if self.robot.convex:
@@ -184,7 +186,15 @@ class Model(SurrogateModel):
         kernels.effector_gradients(u, context.slot, B1, B1T, B2, B2T, V, *coefficients, scaled, gradient)
         return gradient / self.half_range
 
-    def _search(self, context, target, guess, unilateral, tolerance, iterations):
+    def search(
+        self,
+        context: Context,
+        target: np.ndarray,
+        guess: np.ndarray,
+        unilateral: np.ndarray,
+        tolerance: float,
+        iterations: int,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         body = context.arrays
         displacement, effort = np.empty(guess.shape), np.empty(guess.shape)
         converged = np.empty(len(guess), dtype=bool)

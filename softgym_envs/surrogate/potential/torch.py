@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from softgym_envs.surrogate.potential.model import Model, coefficient_sizes
+from softgym_envs.surrogate.potential.model import SHIFT, Model, coefficient_sizes
 
 Coefficients = dict[str, Tensor]
 """Coefficients of bodies by name; those of members have shape (M, S, ...), the others (S, ...), for S bodies."""
@@ -98,8 +98,8 @@ class PotentialEnsemble:
         softplus = nn.functional.softplus
         body = {
             "c": torch.cat([part["c1"], part["c2"]], dim=2),
-            "a": softplus(part["a"] - 4.0) * (0.5 / M),
-            "b": softplus(part["b"] - 4.0) / M,
+            "a": softplus(part["a"] - SHIFT) * (0.5 / M),
+            "b": softplus(part["b"] - SHIFT) / M,
             "quadratic": quadratic.mean(dim=0),
             "first": quadratic[0],
             "linear": part["linear"].mean(dim=0),
