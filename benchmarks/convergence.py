@@ -32,7 +32,7 @@ from softgym_envs.testing import box_mesh
 MM = 1e-3
 
 BODIES = 5
-"""Random bodies of each robot besides its baseline."""
+"""Random bodies of each robot besides its baseline, where its study does not name another number."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,7 @@ class Study:
         command: displacements of the actuators.
         options: further options of the robot.
         steps: increments in which the command is reached.
+        bodies: random bodies besides the baseline.
     """
 
     robot: str
@@ -55,6 +56,7 @@ class Study:
     command: tuple[float, ...]
     options: Mapping[str, Any]
     steps: int = 2
+    bodies: int = BODIES
 
 
 def scaled(size: float, ratio: float = 0.6) -> tuple[dict[str, dict[str, Any]], tuple[float, float, float]]:
@@ -78,6 +80,13 @@ TRUNK_LEVELS = {
     "finer": {"mesh": "reference"},
 }
 
+GRIPPER_LEVELS = {
+    "coarser": {"mesh": "accurate", "mesh_size": 10 * MM},
+    "accurate": {"mesh": "accurate"},
+    "finer": {"mesh": "reference"},
+}
+GRIPPER_SIZES = (10 * MM, 6 * MM, 4.2 * MM)
+
 STUDIES = {
     "finger": Study("finger", *scaled(10 * MM), (10 * MM, 10 * MM), {"self_contact": False}),
     "finger_sideways": Study("finger", *scaled(10 * MM), (10 * MM, 8 * MM), {"self_contact": False}),
@@ -91,10 +100,20 @@ STUDIES = {
         {},
         steps=3,
     ),  # fmt: skip
-    "two_finger_gripper": Study("two_finger_gripper", *scaled(10 * MM), (6 * MM, 4 * MM, 4 * MM, 2 * MM), {}),
-    "two_finger_gripper_taut": Study("two_finger_gripper", *scaled(10 * MM), (10 * MM, 8 * MM, 8 * MM, 10 * MM), {}),
+    # Finer meshes of grippers cost a minute for each increment.
+    "two_finger_gripper": Study(
+        "two_finger_gripper", GRIPPER_LEVELS, GRIPPER_SIZES, (6 * MM, 4 * MM, 4 * MM, 2 * MM), {}, bodies=1
+    ),
+    "two_finger_gripper_taut": Study(
+        "two_finger_gripper", GRIPPER_LEVELS, GRIPPER_SIZES, (10 * MM, 8 * MM, 8 * MM, 10 * MM), {}, bodies=0
+    ),
     "three_finger_gripper": Study(
-        "three_finger_gripper", *scaled(10 * MM), (4 * MM, 2 * MM, 4 * MM, 2 * MM, 3 * MM, 3 * MM), {}
+        "three_finger_gripper",
+        GRIPPER_LEVELS,
+        GRIPPER_SIZES,
+        (4 * MM, 2 * MM, 4 * MM, 2 * MM, 3 * MM, 3 * MM),
+        {},
+        bodies=0,
     ),
     "contact_aided_finger": Study("contact_aided_finger", *scaled(8 * MM), (math.radians(10.0),), {}),
     "trunk": Study("trunk", *beams((5, 10, 20)), (20e-9, 0.0, 0.0, 10e-9, 0.0, 0.0), {}),
@@ -173,7 +192,7 @@ def converge(name: str) -> dict[str, object]:
     rng = np.random.default_rng(17)
     first = next(iter(robots.values()))
     designs = {"baseline": first.design_space.baseline}
-    designs |= {str(k + 1): first.design_space.sample(rng) for k in range(BODIES)}
+    designs |= {str(k + 1): first.design_space.sample(rng) for k in range(study.bodies)}
     rows = []
     for body, design in designs.items():
         for mesh, robot in robots.items():
@@ -311,8 +330,8 @@ def guides() -> dict[str, object]:
     unknowns = []
     for factor in (1.0 / 0.6, 1.0, 0.6):
         for radius in (0.0, 1.0 * MM, 1.5 * MM):
-            robot = make_robot("finger", mesh="accurate", self_contact=False, mesh_size=factor * 10 * MM)
-            robot.guide_radius = radius
+            size = factor * 10 * MM
+            robot = make_robot("finger", mesh="accurate", self_contact=False, mesh_size=size, guide_radius=radius)
             model = robot.build()
             finger.setdefault(f"{1e3 * radius:g} mm", []).append(_first_compliance(model))
         unknowns.append(model.equations)

@@ -175,16 +175,18 @@ def finger_costs() -> str:
 
 
 def point_meshes() -> str:
-    """What small elements at guides and contact points change on the mesh `accurate`."""
+    """What small elements at guides and contact points change on the mesh `accurate`, by the guide radius."""
     rows = []
     for row in results("point_meshes")["rows"]:
         before, tip = (", ".join(f"{x + 0.0:.2f}" for x in np.round(row[k], 2)) for k in ("tip before", "tip"))
-        cells = [percent(row["tip moved"]), percent(row["effort changed"]), f"{row['seconds']:.2g}"]
+        cells = [f"{row['effort']:.2f}", percent(row["effort changed"])]
+        moved = percent(row["tip moved"])
         if row["failure"]:
-            tip, cells = "no equilibrium", [""] * len(cells)
-        rows.append([TITLES[row["study"]], row["points"], f"{row['unknowns']:,}", before, tip, *cells])
-    head = ["robot", "1 mm at", "unknowns", "tip, `accurate` [mm]", "tip [mm]", "moved", "effort", "CPU [s]"]
-    return markdown(head, rows, "llrrrrrr")
+            tip, moved, cells = "no equilibrium", "", ["", ""]
+        names = [TITLES[row["study"]], f"{1e3 * row['radius [m]']:g} mm"]
+        rows.append([*names, before, f"{row['effort before']:.2f}", tip, moved, *cells])
+    head = ["robot", "radius", "tip [mm]", "effort [N]", "tip, small elements", "moved", "effort", "changed"]
+    return markdown(head, rows, "lrrrrrrr")
 
 
 CONVERGENCE_TABLES = {

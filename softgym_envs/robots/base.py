@@ -23,7 +23,7 @@ from softgym_envs.robots.actuator import Actuator as Actuator
 from softgym_envs.robots.geometry.meshing import BodyMesh
 from softgym_envs.robots.geometry.morphing import Feature, Morpher
 from softgym_envs.robots.geometry.symmetry import Symmetry
-from softgym_envs.robots.mesh_tiers import UNIFORM, MeshTier, choose_mesh
+from softgym_envs.robots.mesh_tiers import FOLLOWING, UNIFORM, MeshTier, choose_mesh
 
 F = TypeVar("F", bound=Callable[..., None])
 
@@ -316,8 +316,7 @@ class Robot(ABC):
             ),
         )
         assert model.contact is not None
-        crossing = model.contact.intersections(model.nodes)
-        if crossing is not None:
+        if (crossing := model.contact.intersections(model.nodes)) is not None:
             raise InfeasibleDesign(f"robot '{self.name}' at rest: {crossing}")
 
     @property
@@ -334,8 +333,7 @@ class Robot(ABC):
         contact, of meshes and of single robots are left out at their simplest values (`OMITTED`).
         """
         values = {name: vars(self).get(name, value) for name, value in self._options.items()}
-        # These follow from the name of the mesh, but may change in a later version.
-        values |= {name: vars(self)[name] for name in ("feature_size", "guide_radius") if vars(self).get(name)}
+        values |= {name: vars(self)[name] for name in FOLLOWING if vars(self).get(name)}
         return {
             name: _json_value(value, f"option '{name}' of robot '{self.name}'")
             for name, value in values.items()
@@ -458,13 +456,13 @@ class MeshedRobot(Robot):
         mesh_size: target edge length [m], instead of that of the mesh; other sizes change in proportion.
         element: name of the solid element (`softgym_envs.mechanics.solids.SOLIDS`), instead of that of the mesh.
         fillet: radius of re-entrant edges [m], instead of that of the mesh; only for robots that can be drawn with it.
+        guide_radius: of the parts on which cables and contact points act [m], instead of that of the mesh; 0: points.
         meshing: ``"morph"`` moves the reference mesh, ``"remesh"`` creates a new mesh for every design.
         material: name of a material of `softgym_envs.mechanics.materials`.
         **options: options of `Robot`.
 
     Attributes:
-        meshes: the robot's meshes by name: ``published``, ``accurate`` and ``reference`` (see `mesh_tiers`). A robot
-            without any needs a ``mesh_size``.
+        meshes: the robot's meshes by name (see `mesh_tiers`). A robot without any needs a ``mesh_size``.
         rounded: whether it can be drawn with fillets.
     """
 
@@ -480,6 +478,7 @@ class MeshedRobot(Robot):
         mesh_size: float | None = None,
         element: str | None = None,
         fillet: float | None = None,
+        guide_radius: float | None = None,
         meshing: str = "morph",
         material: str = "corotational",
         **options: Any,
@@ -489,7 +488,7 @@ class MeshedRobot(Robot):
         if not self.meshes and mesh_size is None:
             raise TypeError(f"robot '{self.name}' has no meshes by name: it needs a mesh_size [m]")
         tier = choose_mesh(self.meshes, mesh) if self.meshes else MeshTier(1.0)
-        given: dict[str, Any] = {"size": mesh_size, "element": element, "fillet": fillet}
+        given: dict[str, Any] = {"size": mesh_size, "element": element, "fillet": fillet, "guide_radius": guide_radius}
         self.tier = tier.changed(self.name, **given, largest=getattr(self, "size", np.inf))
         if self.tier.fillet and not self.rounded:
             raise ValueError(f"robot '{self.name}' cannot be drawn with a fillet: fillet = {fillet!r} m must be zero")
@@ -497,7 +496,8 @@ class MeshedRobot(Robot):
         super().__init__(**options)
         self.material = material
         self.mesh_size, self.element, self.fillet = self.tier.size, self.tier.element, self.tier.fillet
-        self.feature_size, self.guide_radius = self.tier.feature_size, self.tier.guide_radius
+        self.feature_size, self.guide_size = self.tier.feature_size, self.tier.guide_size
+        self.guide_radius = self.tier.guide_radius
         # Surfaces of fillets are not among the features that a mesh is moved with.
         self.meshing = "remesh" if self.fillet else meshing
         self._morpher: Morpher | None = None

@@ -23,21 +23,39 @@ from softgym_envs.mechanics.skins import box_skin
 from softgym_envs.robots.base import Actuator, Robot
 from softgym_envs.robots.geometry.finger_shape import in_flange
 from softgym_envs.robots.geometry.symmetry import Symmetry
-from softgym_envs.robots.soft_finger import TIP_RADIUS, SoftFinger
+from softgym_envs.robots.mesh_tiers import MeshTier
+from softgym_envs.robots.soft_finger import FINGER_MESHES, TIP_RADIUS, SoftFinger
 
 STRAIGHT = np.eye(3)
 TURNED = np.diag([-1.0, -1.0, 1.0])
 """Half a turn about z: the finger then bends towards -y."""
+
+GRIPPER_MESHES = {
+    "published": FINGER_MESHES["published"],
+    "accurate": MeshTier(6.0e-3, "quadratic", feature_size=1.5e-3, guide_radius=3.0e-3, guide_size=1.8e-3),
+    "reference": MeshTier(4.2e-3, "quadratic", feature_size=1.05e-3, guide_radius=3.0e-3, guide_size=1.26e-3),
+}
+"""Meshes of fingers in grippers. What they hold moves less than a free tip, so that the same error is more of its way,
+and guides and contact points decide how far it goes: they act on larger parts, which the elements there resolve. No
+source states the radius of these parts."""
+
+
+class GripperFinger(SoftFinger):
+    """The finger of a gripper, with meshes of its own."""
+
+    meshes = GRIPPER_MESHES
 
 
 class FingerRobot(Robot):
     """One or more two-cable fingers, and what they hold. Held objects have no mass.
 
     Args:
-        mesh: name of a mesh of the finger: ``"published"``, ``"accurate"`` or ``"reference"``.
+        mesh: name of one of `GRIPPER_MESHES`: ``"published"``, ``"accurate"`` or ``"reference"``.
         mesh_size: target edge length of a finger [m], instead of that of the mesh.
         element: name of the solid element, instead of that of the mesh.
         fillet: radius of the fingers' re-entrant edges [m], as for the finger.
+        guide_radius: radius of the parts of the fingers on which cables and contact points act [m], instead of that of
+            the mesh; 0 for single points. No source states it.
         meshing: ``"morph"`` or ``"remesh"``, as for the finger.
         material: name of a material.
         unilateral: whether cables cannot push (default).
@@ -63,6 +81,7 @@ class FingerRobot(Robot):
         mesh_size: float | None = None,
         element: str | None = None,
         fillet: float | None = None,
+        guide_radius: float | None = None,
         meshing: str = "morph",
         material: str = "corotational",
         unilateral: bool = True,
@@ -70,12 +89,13 @@ class FingerRobot(Robot):
         **options: Any,
     ) -> None:
         super().__init__(gravity=gravity, **options)
-        self.finger = SoftFinger(
+        self.finger = GripperFinger(
             cables=2,
             mesh=mesh,
             mesh_size=mesh_size,
             element=element,
             fillet=fillet,
+            guide_radius=guide_radius,
             meshing=meshing,
             material=material,
             unilateral=unilateral,
@@ -83,7 +103,8 @@ class FingerRobot(Robot):
         )
         self.mesh_size, self.element, self.fillet = self.finger.mesh_size, self.finger.element, self.finger.fillet
         self.meshing = self.finger.meshing
-        self.feature_size, self.guide_radius = self.finger.feature_size, self.finger.guide_radius
+        self.feature_size, self.guide_size = self.finger.feature_size, self.finger.guide_size
+        self.guide_radius = self.finger.guide_radius
         self.design_space = DesignSpace(*self.variables())
         self.actuators = tuple(
             Actuator(f"finger_{k + 1}_{cable.name}", *self.cable_range, self.cable_rate, unilateral=unilateral)

@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
@@ -19,8 +19,11 @@ from softgym_envs.mechanics.solids import SOLIDS
 
 T = TypeVar("T")
 
-UNIFORM: dict[str, object] = {"mesh": "published", "element": "linear", "fillet": 0.0}
+UNIFORM: dict[str, object] = {"mesh": "published", "element": "linear", "fillet": 0.0, "guide_radius": 0.0}
 """Options of the mesh that are not part of a robot's key: those of the published scenes."""
+
+FOLLOWING = ("feature_size", "guide_radius", "guide_size")
+"""Parts of a mesh that are in a robot's key, though they follow from its name: a later version may change them."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +37,7 @@ class MeshTier:
         fillet: radius of re-entrant edges [m]; 0 for sharp edges.
         guide_radius: radius of the part of the body on which a cable's guide, or another point that carries a load,
             acts [m]; 0 for a single point.
+        guide_size: edge length in those parts of the body [m]; None where it is that of the elements around them.
     """
 
     size: float
@@ -41,9 +45,17 @@ class MeshTier:
     feature_size: float | None = None
     fillet: float = 0.0
     guide_radius: float = 0.0
+    guide_size: float | None = None
 
     def changed(
-        self, robot: str, *, size: float | None, element: str | None, fillet: float | None, largest: float = np.inf
+        self,
+        robot: str,
+        *,
+        size: float | None,
+        element: str | None,
+        fillet: float | None,
+        guide_radius: float | None,
+        largest: float = np.inf,
     ) -> MeshTier:
         """Return a tier in which the options that are given replace those of this one.
 
@@ -54,12 +66,14 @@ class MeshTier:
         """
         size = self.size if size is None else size
         fillet = self.fillet if fillet is None else fillet
+        guide_radius = self.guide_radius if guide_radius is None else guide_radius
         element = self.element if element is None else element
         if not (isinstance(size, int | float) and 0.0 < size < np.inf):
             raise ValueError(f"robot '{robot}': mesh_size = {size!r} m must be positive and finite")
-        if not (isinstance(fillet, int | float) and 0.0 <= fillet < np.inf):
-            raise ValueError(f"robot '{robot}': fillet = {fillet!r} m must be finite and not negative")
-        for name, length in (("mesh_size", size), ("fillet", fillet)):
+        for name, length in (("fillet", fillet), ("guide_radius", guide_radius)):
+            if not (isinstance(length, int | float) and 0.0 <= length < np.inf):
+                raise ValueError(f"robot '{robot}': {name} = {length!r} m must be finite and not negative")
+        for name, length in (("mesh_size", size), ("fillet", fillet), ("guide_radius", guide_radius)):
             if length > largest:
                 raise ValueError(
                     f"robot '{robot}': {name} = {length:g} m is larger than the robot, whose size is {largest:g} m; "
@@ -67,8 +81,8 @@ class MeshTier:
                 )
         if element not in SOLIDS:
             raise ValueError(unknown_name("element", element, SOLIDS))
-        scaled = None if self.feature_size is None else self.feature_size * size / self.size
-        return replace(self, size=float(size), element=element, feature_size=scaled, fillet=float(fillet))
+        feature, guide = (None if s is None else s * size / self.size for s in (self.feature_size, self.guide_size))
+        return MeshTier(float(size), element, feature, float(fillet), float(guide_radius), guide)
 
 
 def choose_mesh(meshes: Mapping[str, T], mesh: Any) -> T:

@@ -80,6 +80,8 @@ class SoftFinger(MeshedRobot):
         mesh_size: target edge length [m], instead of that of the mesh.
         fillet: radius of the re-entrant edges at the joints [m], which no source states; by default they are sharp, as
             drawn. A fillet makes the finger stiffer, see its page.
+        guide_radius: radius of the parts of the body on which cables and contact points act [m], instead of that of the
+            mesh; 0 for single points. No source states it.
         unilateral: whether cables cannot push (default). False reproduces published scenes, where they can.
         contacts: whether to add three contact points (role ``c``) to the front of the last segment (sec. 4.3.2).
         self_contact: whether surfaces of the finger touch each other, as the faces of its notches do from about 10 mm
@@ -104,6 +106,7 @@ class SoftFinger(MeshedRobot):
         mesh: str = "published",
         mesh_size: float | None = None,
         fillet: float | None = None,
+        guide_radius: float | None = None,
         unilateral: bool = True,
         contacts: bool = False,
         self_contact: bool | None = None,
@@ -123,6 +126,7 @@ class SoftFinger(MeshedRobot):
             mesh=mesh,
             mesh_size=mesh_size,
             fillet=fillet,
+            guide_radius=guide_radius,
             self_contact=touching,
             contact_distance=contact_distance,
             **options,
@@ -184,7 +188,7 @@ class SoftFinger(MeshedRobot):
         """Mesh the body of a complete design, or the half that `unfold` completes."""
         lengths = self.lengths(design)
         check_finger(lengths)
-        return mesh_finger(lengths, self.tier)
+        return mesh_finger(lengths, self.tier, self.loaded_parts(design))
 
     def unfold(self, part: BodyMesh) -> BodyMesh:
         """Complete the body of a graded mesh."""
@@ -215,6 +219,13 @@ class SoftFinger(MeshedRobot):
         angles = math.pi / 2 + 2.0 * math.pi / 3 * np.arange(3)
         circle = CONTACT_RADIUS * np.column_stack([np.cos(angles), np.zeros(3), np.sin(angles)])
         return np.array([0.0, design["height"], -2.5 * design["length"]]) + circle
+
+    def loaded_parts(self, design: Mapping[str, float]) -> np.ndarray:
+        """Return balls around guides and contact points of the half x >= 0, rows of middle and radius [m], (k, 4)."""
+        guides = np.concatenate([points for _, points in self.routes(design)])
+        contact = [*self.contact_points(design).mean(axis=0), CONTACT_RADIUS + self.guide_radius]
+        balls = np.column_stack([guides, np.full(len(guides), self.guide_radius)])
+        return np.vstack([balls[guides[:, 0] >= 0.0], contact])
 
     def guess(self, nodes: np.ndarray, design: Mapping[str, float]) -> np.ndarray:
         """Return displacements that stretch the body along z with the segment length."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import gmsh
 import numpy as np
@@ -43,15 +44,20 @@ def test_every_robot_has_three_meshes_with_keys_of_their_own(name):
 
 
 def test_options_replace_parts_of_a_mesh():
-    tier = MeshTier(0.010, "quadratic", feature_size=0.002, fillet=1e-3, guide_radius=1e-3)
-    same = {"size": None, "element": None, "fillet": None}
+    tier = MeshTier(0.010, "quadratic", feature_size=0.002, fillet=1e-3, guide_radius=1e-3, guide_size=4e-3)
+    same = {"size": None, "element": None, "fillet": None, "guide_radius": None}
     assert tier.changed("arm", **same) == tier
     finer = tier.changed("arm", **same | {"size": 0.005})
-    assert finer == MeshTier(0.005, "quadratic", feature_size=0.001, fillet=1e-3, guide_radius=1e-3)
+    assert finer == MeshTier(0.005, "quadratic", feature_size=0.001, fillet=1e-3, guide_radius=1e-3, guide_size=2e-3)
     assert tier.changed("arm", **same | {"element": "linear", "fillet": 0.0}).fillet == 0.0
+    assert tier.changed("arm", **same | {"guide_radius": 0}) == replace(tier, guide_radius=0.0)
     for change, message in (
         ({"size": 0.0}, "'arm': mesh_size = 0.0 m must be positive"),
         ({"fillet": -1e-3}, "'arm': fillet = -0.001 m must be finite"),
+        ({"guide_radius": -1e-3}, "'arm': guide_radius = -0.001 m must be finite"),
+        ({"guide_radius": float("nan")}, "'arm': guide_radius = nan m must be finite"),
+        ({"guide_radius": "3 mm"}, "'arm': guide_radius = '3 mm' m must be finite"),
+        ({"guide_radius": 3.0, "largest": 0.12}, "guide_radius = 3 m is larger than the robot.*did you mean metres"),
         ({"element": "linaer"}, "unknown element 'linaer'; did you mean 'linear'"),
     ):
         with pytest.raises(ValueError, match=message):
@@ -61,6 +67,49 @@ def test_options_replace_parts_of_a_mesh():
 def test_a_robot_that_cannot_be_drawn_with_fillets_says_so():
     with pytest.raises(ValueError, match="'diamond' cannot be drawn with a fillet"):
         make_robot("diamond", fillet=1e-3)
+
+
+def test_the_guide_radius_is_an_option_and_part_of_the_key():
+    for name, radius in (("finger", 1e-3), ("press_finger", 3e-3), ("two_finger_gripper", 3e-3)):
+        by_mesh = [make_robot(name, mesh=mesh) for mesh in NAMES]
+        assert [robot.guide_radius for robot in by_mesh] == [0.0, radius, radius]
+        assert [robot.mechanics_key.get("guide_radius") for robot in by_mesh] == [None, radius, radius]
+        key = by_mesh[1].mechanics_key
+        assert make_robot(name, mesh="accurate", guide_radius=radius).mechanics_key == key
+        other = make_robot(name, mesh="accurate", guide_radius=2e-3)
+        assert other.guide_radius == 2e-3 and other.mechanics_key == key | {"guide_radius": 2e-3}
+        points = make_robot(name, mesh="accurate", guide_radius=0.0)
+        assert points.guide_radius == 0.0 and "guide_radius" not in points.mechanics_key
+        with pytest.raises(ValueError, match="guide_radius = -0.001 m must be finite and not negative"):
+            make_robot(name, mesh="accurate", guide_radius=-1e-3)
+
+
+def test_elements_of_grippers_are_small_where_loads_act():
+    gripper = make_robot("two_finger_gripper", mesh="accurate", mesh_size=30e-3)
+    assert gripper.guide_size == 9e-3 and gripper.mechanics_key["guide_size"] == 9e-3
+    finger = gripper.finger
+    mesh, balls = finger.body(), finger.loaded_parts(finger.design_space.baseline)
+    assert balls.shape == (7, 4)  # six guides of one cable, and the middle of the contact points
+    edges = mesh.tetrahedra[:, [0, 0, 0, 1, 1, 2, 1, 2, 3, 2, 3, 3]].reshape(-1, 2, 6)
+    lengths = np.linalg.norm(mesh.nodes[edges[:, 0]] - mesh.nodes[edges[:, 1]], axis=2).mean(axis=1)
+    middles = mesh.nodes[mesh.tetrahedra].mean(axis=1)
+    for *middle, radius in balls:
+        near = np.linalg.norm(middles - middle, axis=1) < radius + 2e-3
+        assert near.any() and np.median(lengths[near]) < 1.2 * gripper.guide_size
+
+
+def test_a_guide_of_a_gripper_does_not_reach_over_a_notch():
+    robot = make_robot("two_finger_gripper", mesh="accurate", mesh_size=16e-3)
+    box = robot.design_space
+    for joint_height in (box["joint_height"].low, box["joint_height"].high):
+        design = box.complete({"joint_height": joint_height})
+        model = robot.build(design)
+        for cable in model.constraints["a"]:
+            # Guides are where the cable leaves and enters segments: two in each of three.
+            assert len(cable.embedding.points) == 6
+            for k, nodes in enumerate(cable.embedding.node_ids):
+                z = model.nodes[nodes, 2] / design["length"]
+                assert (z <= -(k // 2)).all() and (z >= -(k // 2) - 1).all()
 
 
 def test_a_graded_finger_is_symmetric(finger):

@@ -1,11 +1,12 @@
 """Meshes of fingers: of one element size, or of a half with small elements at the joints, where a finger bends.
 
-Re-entrant edges at the joints may be rounded by a fillet. The half is mirrored, so the whole finger is symmetric.
+Re-entrant edges at the joints may be rounded by a fillet, and elements may be small where loads act. The half is
+mirrored, so the whole finger is symmetric.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from softgym_envs.robots.geometry.finger_shape import draw_finger, finger_features
@@ -23,21 +24,28 @@ PROBE_DISTANCE = 0.05  # [mm]
 LEAST_ANGLE = 190.0  # of material around an edge that is rounded [degrees]
 
 
-def mesh_finger(lengths: dict[str, float], tier: MeshTier) -> BodyMesh:
+def mesh_finger(lengths: dict[str, float], tier: MeshTier, balls: Sequence[Sequence[float]] = ()) -> BodyMesh:
     """Mesh the finger of `draw_finger`, or its half x >= 0 if the mesh is graded or has fillets.
 
     Args:
         lengths: parameters of `draw_finger` [mm, rad].
         tier: sizes and fillet.
+        balls: middle and radius (4,) [m] of each part of the half in which elements have the tier's ``guide_size``.
     """
     if not is_half(tier):
         return mesh_geometry(draw_finger, lengths, mesh_size=tier.size)
     sizes = {"size": tier.size, "feature_size": tier.feature_size or tier.size, "fillet": tier.fillet}
+    draw, uses = draw_half_finger, (draw_finger, round_joints, angle_of_material)
+    if tier.guide_size is not None:
+        draw, uses = draw_graded_balls, (draw_half_finger, *uses)
+        sizes |= {"ball_size": tier.guide_size}
+        sizes |= {f"{letter}{k}": x for k, ball in enumerate(balls) for letter, x in zip("xyzr", ball, strict=True)}
+        lengths = lengths | {"count": float(len(balls))}
     return mesh_geometry(
-        draw_half_finger,
-        lengths | {name: round(1e3 * value, 9) for name, value in sizes.items()},
+        draw,
+        lengths | {name: round(1e3 * float(value), 9) for name, value in sizes.items()},
         mesh_size=tier.size,
-        uses=(draw_finger, round_joints, angle_of_material),
+        uses=uses,
         time_limit=300.0,
     )
 
@@ -101,6 +109,30 @@ def draw_half_finger(*, size: float, feature_size: float, fillet: float, **lengt
     field.setAsBackgroundMesh(smallest)
     gmsh.option.setNumber("Mesh.MeshSizeMin", 0.0)
     gmsh.option.setNumber("Mesh.MeshSizeMax", 1e22)
+
+
+def draw_graded_balls(*, ball_size: float, count: float, **options: float) -> None:
+    """Draw half a finger with gmsh, as `draw_half_finger`, with small elements in balls.
+
+    Args:
+        ball_size: largest edge length in the balls [mm]; it grows away from them.
+        count: number of balls.
+        **options: middles ``x0``, ``y0``, ``z0``, ``x1``, ... and radii ``r0``, ``r1``, ... of the balls [mm]; and
+            those of `draw_half_finger`.
+    """
+    import gmsh
+
+    balls = [[options.pop(f"{letter}{k}") for letter in "xyzr"] for k in range(int(count))]
+    draw_half_finger(**options)
+    field = gmsh.model.mesh.field
+    sizes = [int(max(field.list()))]  # the sizes that were set already
+    for x, y, z, radius in balls:
+        sizes.append(field.add("MathEval"))
+        away = f"max(0, sqrt((x - ({x}))^2 + (y - ({y}))^2 + (z - ({z}))^2) - {radius})"
+        field.setString(sizes[-1], "F", f"{ball_size} + {GRADING} * {away}")
+    smallest = field.add("Min")
+    field.setNumbers(smallest, "FieldsList", sizes)
+    field.setAsBackgroundMesh(smallest)
 
 
 def round_joints(lengths: Mapping[str, float], fillet: float) -> list[int]:
