@@ -169,6 +169,9 @@ STRENGTH = "configs/design/finger_strength.yaml"
             ["environment.residual_scale = 0.5", "finger_reach", "0.0"],
         ),
         (["evaluate", "--config", CONFIG, "--goals", "0"], ["goals", "0"]),
+        (["evaluate", "--config", CONFIG, "--output", "/dev/null/x.json"], ["'/dev/null' cannot be a folder"]),
+        (["evaluate", "--config", CONFIG, "--output", "."], ["--output '.' is a folder; name a file"]),
+        (["show", "finger", "--picture", "x.jpg"], ["picture 'x.jpg' must end with .png"]),
         (
             ["evaluate", "--config", CONFIG, "--agent", "finger_reach", "environment.action_mode=absolute"],
             ["environment.action_mode = absolute", "finger_reach", "increment"],

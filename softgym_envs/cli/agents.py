@@ -94,6 +94,10 @@ def evaluate(
         raise ConfigError(f"--goals {goals} must be at least 1")
     if workers < 1:
         raise ConfigError(f"--workers {workers} must be at least 1")
+    if output is not None:  # before the work begins
+        if output.is_dir():
+            raise ConfigError(f"--output '{output}' is a folder; name a file")
+        output.parent.mkdir(parents=True, exist_ok=True)
     for agent in agents:  # reject an invalid policy before any evaluation
         check_agent(agent)
         if agent not in BASELINES:

@@ -24,6 +24,8 @@ def show(robot: str, options_: tuple[str, ...], design: tuple[str, ...], picture
     """Show a robot: its design variables, actuators and mesh."""
     from softgym_envs.robots.base import MeshedRobot
 
+    if picture is not None and picture.suffix.lower() != ".png":
+        raise ConfigError(f"picture '{picture}' must end with .png")
     body = options.robot_of(robot, options_)
     chosen = options.design_of(design)
     model = body.build(chosen)
