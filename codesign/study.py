@@ -222,7 +222,7 @@ def _run_trials(study: StudyFolder, workers: int, output: Progress) -> None:
 
 def _run_finalists(study: StudyFolder, workers: int, output: Progress) -> None:
     output.tests(quiet=True)
-    refinement = study.config.finalists.refinement
+    refinement, first = study.config.finalists.refinement, True
     while True:  # the tests on a finer mesh are known after the others
         snapshot = load_study(study)
         jobs = finalist_jobs(snapshot)
@@ -235,9 +235,10 @@ def _run_finalists(study: StudyFolder, workers: int, output: Progress) -> None:
                 goals, backends = len(study.goals["unseen"]), " and ".join(study.config.test_backends)
                 text = f"{len(snapshot.finalists)} bodies on {goals} unseen goals, {backends}"
             done = len(jobs) - len(missing)
-            before = f", {done} of {len(jobs)} tests finished before" if done else ""
+            before = f", {done} of {len(jobs)} tests finished before" if done and first else ""
             output.begin("test", text + before, len(jobs), done)
             _run_jobs(study, "finalists", missing, workers, output.tests)
+        first = False
 
 
 def _require(done: bool, phase: str, stopped: str | None) -> None:
