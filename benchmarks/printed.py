@@ -76,7 +76,8 @@ def printed_table() -> str:
         for load in LOADS:
             values = (found[f"{name}: {count} cells: {load}, compliance over resolved"] for count in CELLS)
             rows.append([name, load, *(f"{100.0 * (value - 1.0):+.1f}" for value in values)])
-    return markdown(["lattice", "load", *(f"{count} cells [%]" for count in CELLS)], rows, "ll" + "r" * len(CELLS))
+    heads = [f"{count} cell{'s' * (count > 1)} high [%]" for count in CELLS]
+    return markdown(["lattice", "load", *heads], rows, "ll" + "r" * len(CELLS))
 
 
 TABLES = {"printed": printed_table}

@@ -240,7 +240,7 @@ def _run_trials(study: StudyFolder, workers: int, output: Progress) -> None:
 
 def _run_finalists(study: StudyFolder, workers: int, output: Progress) -> None:
     output.tests(quiet=True)
-    refinement = study.config.finalists.refinement
+    refinement, first = study.config.finalists.refinement, True
     while True:  # the tests on a finer mesh are known after the others
         snapshot = load_study(study)
         jobs = finalist_jobs(snapshot)
@@ -255,9 +255,10 @@ def _run_finalists(study: StudyFolder, workers: int, output: Progress) -> None:
                     f"{counted(len(snapshot.finalists), 'body')} on {goals}, {' and '.join(study.config.test_backends)}"
                 )
             done = len(jobs) - len(missing)
-            before = f", {done} of {counted(len(jobs), 'test')} finished before" if done else ""
+            before = f", {done} of {counted(len(jobs), 'test')} finished before" if done and first else ""
             output.begin("test", text + before, len(jobs), done)
             _run_jobs(study, output, "finalists", missing, workers, output.tests)
+        first = False
 
 
 def _require(done: bool, phase: str, stopped: str | None) -> None:

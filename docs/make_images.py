@@ -1,8 +1,8 @@
 """Draw the pictures of the documentation: ``make docs-images``, or ``python docs/make_images.py [NAME ...]``.
 
-Names are those of robots, of environment pages (``finger_reach``), of their films (``finger_reach.webp``) and of other
-pictures; default: all. Pictures go to ``docs/images/NAME.png``, the animation to ``docs/images/episodes.webp``. The
-picture ``report`` needs a finished study (``make demo``) and Chromium, so it is drawn only when it is named.
+Names are those of robots, of the films of environment pages (``finger_reach.webp``) and of other pictures; default:
+all. Pictures go to ``docs/images/NAME.png``, the animation to ``docs/images/episodes.webp``. The picture ``report``
+needs a finished study (``make demo``) and Chromium, so it is drawn only when it is named.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from softgym_envs.mechanics import Statics
 from softgym_envs.mechanics.elements.tetrahedra import boundary_triangles
 from softgym_envs.robots import ROBOTS
 from softgym_envs.robots.modules import MODULES
-from softgym_envs.viewer.image import ImageRenderer, render_bodies
+from softgym_envs.viewer.image import ImageRenderer
 from softgym_envs.viewer.video import write_video
 
 # Share of the range of each actuator, for the actuated half of a robot's picture.
@@ -71,7 +71,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "finger_grasp": {"backend": "fem", "robot_options": {"object": "hexagon"}},  # easier to see than a plane
     "modular_reach": {"backend": "fem", "robot_options": {"body": "solid"}},  # superelements are drawn as bars
 }
-"""Options of environments for their pictures and films."""
+"""Options of environments for their films."""
 
 
 def draw_robot(name: str) -> np.ndarray:
@@ -84,20 +84,6 @@ def draw_robot(name: str) -> np.ndarray:
         return np.concatenate([renderer.render_body(), renderer.render_body(command=command)], axis=1)
     finally:
         renderer.close()
-
-
-def draw_environment(name: str) -> np.ndarray:
-    """Draw an environment on finite elements while the inverse QP moves it to its goal."""
-    options = {"backend": "fem", **OPTIONS.get(name, {})}
-    env = gymnasium.make(environment_pages()[name], render_mode="rgb_array", render_size=(WIDTH, HEIGHT), **options)
-    act = make_agent("qp")
-    observation, _ = env.reset(seed=1)
-    unwrapped: Any = env.unwrapped
-    for _ in range(unwrapped.task.horizon // 2 - 1 if unwrapped.task.horizon > 1 else 16):
-        observation, *_ = env.step(act(observation, unwrapped))
-    image = np.asarray(env.render())
-    env.close()
-    return image
 
 
 def draw_film(name: str, path: Path) -> None:
@@ -129,14 +115,6 @@ def draw_episodes(path: Path) -> None:
             films.append(images)
     length = max(map(len, films))
     write_video(path, [np.concatenate([f[min(k, len(f) - 1)] for f in films], axis=1) for k in range(length)], fps=8.0)
-
-
-def draw_codesign() -> np.ndarray:
-    """Draw the baseline finger and the winner of the demo study."""
-    designs = [{}, {"length": 0.038, "height": 0.0211, "joint_height": 0.005}]
-    return render_bodies(
-        make_robot("finger"), designs, np.array([0.020, 0.017]), (480, 480), texts=["baseline", "co-designed"]
-    )
 
 
 def draw_grasp() -> np.ndarray:
@@ -227,13 +205,13 @@ def draw_report() -> np.ndarray:
 
 def main(names: list[str]) -> None:
     """Draw the named pictures, or all but the report."""
-    table: dict[str, Callable[[], np.ndarray]] = {"codesign": draw_codesign, "arm": draw_arm, "grasp": draw_grasp}
+    table: dict[str, Callable[[], np.ndarray]] = {"arm": draw_arm, "grasp": draw_grasp}
     table |= {"convergence": convergence_tables.draw, "modules": draw_modules, "structures": draw_structures}
     table |= {"grown_shapes": grown_shapes.draw}
     table |= {"benchmark_regret": plots.draw_regret, "benchmark_winners": plots.draw_winners}
     table |= {name: partial(draw_robot, name) for name in ROBOTS}
-    table |= {name: partial(draw_environment, name) for name in environment_pages()}
-    every = [*table, *(f"{name}.webp" for name in environment_pages()), "episodes"]
+    films = [f"{name}.webp" for name in environment_pages()]
+    every = [*table, *films, "episodes"]
     if unknown := [name for name in names if name not in (*every, "report")]:
         raise SystemExit(f"unknown pictures {', '.join(unknown)}; allowed: {', '.join(every)}, report")
     for name in names or every:

@@ -89,6 +89,12 @@ def test_nothing_limits_if_every_goal_is_reached(tested):
     assert not any("limits" in title for title in found)
 
 
+@pytest.mark.parametrize("second, lost", [(1e-3, False), (4e-3, True)])
+def test_goals_that_only_the_baseline_reaches_are_counted(tested, second, lost):
+    snapshot = tested([1e-3, second, 4e-3, 4e-3, 4e-3, 1e-3], FAR)  # the baseline reaches the second goal only
+    assert ("The baseline reaches 1 of them." in findings(snapshot, collect(snapshot))[0].text) == lost
+
+
 @pytest.mark.parametrize("place, count", [((0.5, 0.5), 0), ((0.0, 0.5), 1), ((1.0, 0.0), 2)])
 def test_variables_at_a_limit_are_named(tested, place, count):
     snapshot = tested(FAR, FAR, place)
