@@ -32,7 +32,7 @@ from softgym_envs.testing import box_mesh
 MM = 1e-3
 
 BODIES = 5
-"""Random bodies of each robot besides its baseline, where its study does not name another number."""
+"""Random bodies of each robot besides its baseline."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Study:
         command: displacements of the actuators.
         options: further options of the robot.
         steps: increments in which the command is reached.
-        bodies: random bodies besides the baseline.
+        bodies: number of random bodies, instead of ``BODIES``.
     """
 
     robot: str
@@ -56,7 +56,7 @@ class Study:
     command: tuple[float, ...]
     options: Mapping[str, Any]
     steps: int = 2
-    bodies: int = BODIES
+    bodies: int | None = None
 
 
 def scaled(size: float, ratio: float = 0.6) -> tuple[dict[str, dict[str, Any]], tuple[float, float, float]]:
@@ -192,7 +192,8 @@ def converge(name: str) -> dict[str, object]:
     rng = np.random.default_rng(17)
     first = next(iter(robots.values()))
     designs = {"baseline": first.design_space.baseline}
-    designs |= {str(k + 1): first.design_space.sample(rng) for k in range(study.bodies)}
+    bodies = BODIES if study.bodies is None else study.bodies
+    designs |= {str(k + 1): first.design_space.sample(rng) for k in range(bodies)}
     rows = []
     for body, design in designs.items():
         for mesh, robot in robots.items():

@@ -188,7 +188,7 @@ class SoftFinger(MeshedRobot):
         """Mesh the body of a complete design, or the half that `unfold` completes."""
         lengths = self.lengths(design)
         check_finger(lengths)
-        return mesh_finger(lengths, self.tier, self.loaded_parts(design))
+        return mesh_finger(lengths, self.tier, self.loaded_parts(design).tolist())
 
     def unfold(self, part: BodyMesh) -> BodyMesh:
         """Complete the body of a graded mesh."""

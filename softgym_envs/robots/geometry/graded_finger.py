@@ -6,7 +6,7 @@ mirrored, so the whole finger is symmetric.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from softgym_envs.robots.geometry.finger_shape import draw_finger, finger_features
@@ -35,7 +35,8 @@ def mesh_finger(lengths: dict[str, float], tier: MeshTier, balls: Sequence[Seque
     if not is_half(tier):
         return mesh_geometry(draw_finger, lengths, mesh_size=tier.size)
     sizes = {"size": tier.size, "feature_size": tier.feature_size or tier.size, "fillet": tier.fillet}
-    draw, uses = draw_half_finger, (draw_finger, round_joints, angle_of_material)
+    draw: Callable[..., None] = draw_half_finger
+    uses: tuple[Callable[..., Any], ...] = (draw_finger, round_joints, angle_of_material)
     if tier.guide_size is not None:
         draw, uses = draw_graded_balls, (draw_half_finger, *uses)
         sizes |= {"ball_size": tier.guide_size}
