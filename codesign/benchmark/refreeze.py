@@ -60,8 +60,8 @@ def refreeze(name: str, bodies: int = 5, data: Path = DATA) -> list[Path]:
         allowed = SAME * np.maximum(np.abs(scores), np.abs(run.baseline))
         if not found.feasible or not (np.abs(np.subtract(found.scores, scores)) <= allowed).all():
             raise DataError(
-                f"problem '{name}': a winner of {run.method}, seed {run.seed}, had the scores {scores.tolist()} and now "
-                f"has {found.scores}; this is another problem and needs a new version"
+                f"problem '{name}': a winner of {run.method}, seed {run.seed}, had the scores {scores.tolist()} and "
+                f"now has {found.scores}; this is another problem and needs a new version"
             )
     old = problem.hash
     freeze(name)

@@ -246,8 +246,8 @@ def board_(paths: tuple[Path, ...]) -> None:
 def freeze(names: tuple[str, ...], keep: bool) -> None:
     """Freeze problems NAMES: draw their goals, and store them with the hashes (source checkout).
 
-    Some changes alter the hash but no score, such as another spelling of an option. With --keep, some stored winners are
-    scored again; if no score differs, the stored results get the new hash.
+    Some changes alter the hash but no score, such as another spelling of an option. With --keep, some stored winners
+    are scored again; if no score differs, the stored results get the new hash.
     """
     from softgym_envs.codesign.benchmark import frozen
     from softgym_envs.codesign.benchmark.refreeze import refreeze
