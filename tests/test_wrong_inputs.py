@@ -151,7 +151,7 @@ MISTAKES = {
     ),
     "robot option": (
         lambda _: make_robot("diamond", mesh_sise=0.01),
-        "robot 'diamond': unknown option 'mesh_sise'; did you mean 'mesh_size'? allowed: mesh, unilateral, mesh_size, *",
+        "robot 'diamond': unknown option 'mesh_sise'; did you mean 'mesh_size'? allowed: mesh, unilateral, *",
     ),
     "robot option, of many": (
         lambda _: make_robot("finger", cabels=1),
