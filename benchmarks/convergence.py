@@ -102,7 +102,7 @@ STUDIES = {
     ),  # fmt: skip
     # Finer meshes of grippers cost a minute for each increment.
     "two_finger_gripper": Study(
-        "two_finger_gripper", GRIPPER_LEVELS, GRIPPER_SIZES, (6 * MM, 4 * MM, 4 * MM, 2 * MM), {}, bodies=1
+        "two_finger_gripper", GRIPPER_LEVELS, GRIPPER_SIZES, (6 * MM, 4 * MM, 4 * MM, 2 * MM), {}, bodies=4
     ),
     "two_finger_gripper_taut": Study(
         "two_finger_gripper", GRIPPER_LEVELS, GRIPPER_SIZES, (10 * MM, 8 * MM, 8 * MM, 10 * MM), {}, bodies=0
