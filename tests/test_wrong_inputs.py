@@ -150,12 +150,8 @@ MISTAKES = {
         "unknown robot 'fingr'; did you mean 'finger'? allowed: finger, diamond, *",
     ),
     "robot option": (
-        lambda _: make_robot("diamond", mesh_sise=0.01),
-        "robot 'diamond': unknown option 'mesh_sise'; did you mean 'mesh_size'? allowed: mesh, unilateral, *",
-    ),
-    "robot option, of many": (
         lambda _: make_robot("finger", cabels=1),
-        "robot 'finger': unknown option 'cabels'; did you mean 'cables'?",
+        "robot 'finger': unknown option 'cabels'; did you mean 'cables'? allowed: cables, mesh, mesh_size, *",
     ),
     "robot option of the wrong type": (
         lambda _: make_robot("finger", cables="two"),

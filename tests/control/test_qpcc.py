@@ -88,7 +88,7 @@ def test_results_are_never_worse_than_the_start_even_if_the_search_ends_there(se
 
 def test_a_search_that_ends_before_any_set_is_found_raises():
     problem = random_problem(0, 5)
-    with pytest.raises(ConvergenceError, match="within 1 programs"):
+    with pytest.raises(ConvergenceError, match="within 1 program$"):
         solve_qpcc(problem, max_programs=1)
 
 

@@ -365,7 +365,7 @@ def test_manifest_and_card(made):
     assert manifest["plan"]["sequence"] == "halton"
     card = (folder / "README.md").read_text()
     assert card.startswith("# States of robot `finger`\n\n16 states of 4 bodies, by `softgym dataset`")
-    assert "0 bodies are infeasible or have no equilibrium at rest, 0 commands have no equilibrium" in card
+    assert "0 bodies without a mesh or without an equilibrium at rest, and 0 commands without an equilibrium" in card
     column = data["effector"][:, 1]
     assert f"| effector: tip y | 16 | {column.min():.6g} | {column.max():.6g} |" in card
     for label in ("design: joint_height", "displacement: cable_2", "effort: cable_1", "compliance: upper triangle"):
