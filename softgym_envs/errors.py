@@ -54,7 +54,7 @@ class ConfigError(SoftGymError, ValueError):
     """A configuration file or command-line override is malformed."""
 
 
-MAX_NAMES = 20
+MAX_NAMES = 17
 """Largest number of allowed names that a message lists besides the nearest one."""
 
 
