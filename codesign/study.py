@@ -193,8 +193,11 @@ def _run_screen(study: StudyFolder, workers: int, output: Progress) -> None:
     jobs = screen_jobs(study)
     if missing := missing_jobs(study, jobs):
         output.begin("screen", f"{counted(len(missing), 'body')} scored by the inverse QP", len(missing))
-        done = lambda: output.screened(sum(job.path.exists() for job in missing))  # noqa: E731
-        _run_jobs(study, output, "screen", missing, workers, done)
+
+        def tick() -> None:
+            output.screened(sum(job.path.exists() for job in missing))
+
+        _run_jobs(study, output, "screen", missing, workers, tick)
     output.say(f"screen: kept {len(kept_bodies(study))} of {counted(len(jobs), 'body')}")
 
 

@@ -17,9 +17,9 @@ from softgym_envs.storage import atomic_write
 SAME = 1e-5
 """Largest difference between a stored score and its repetition, relative to the larger of it and the baseline's score.
 
-Leaderboards show scores as parts of the way from the baseline to the best known body, with fewer digits. A relative
-difference would tell nothing: winners come within less than a micrometre of their goals, which solvers of other
-versions repeat to a nanometre.
+Leaderboards show scores as parts of the way from the baseline to the best known body, with fewer digits. Relative to
+the score alone, a difference says little: some winners end within a micrometre of their goals, and another version of a
+solver moves them by a nanometre.
 """
 
 FILES = ("runs.json", "winners.json", "references/*.json", "submissions/*.json")

@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -82,7 +82,15 @@ class MeshTier:
         if element not in SOLIDS:
             raise ValueError(unknown_name("element", element, SOLIDS))
         feature, guide = (None if s is None else s * size / self.size for s in (self.feature_size, self.guide_size))
-        return MeshTier(float(size), element, feature, float(fillet), float(guide_radius), guide)
+        return replace(
+            self,
+            size=float(size),
+            element=element,
+            feature_size=feature,
+            fillet=float(fillet),
+            guide_radius=float(guide_radius),
+            guide_size=guide,
+        )
 
 
 def choose_mesh(meshes: Mapping[str, T], mesh: Any) -> T:
