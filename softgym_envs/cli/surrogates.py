@@ -65,6 +65,7 @@ def fit(config: Path, folder: Path, data: Path | None, quiet: bool, overrides: t
 )
 @click.option("--seed", type=click.IntRange(0), default=11, show_default=True, help="Seed of all states.")
 @click.option("--kept-only", is_flag=True, help="Calibrate on what FOLDER holds of an interrupted run.")
+@click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Number of processes.")
 def calibrate_trust(
     robot: str,
     options_: tuple[str, ...],
@@ -75,6 +76,7 @@ def calibrate_trust(
     attacks: int,
     seed: int,
     kept_only: bool,
+    workers: int,
 ) -> None:
     """Calibrate the uncertainty of a surrogate on FEM.
 
@@ -91,7 +93,7 @@ def calibrate_trust(
     with nullcontext() if folder is None else options.resumable():
         found = calibrate(
             weights or pretrained_folder(body), body, bodies=bodies, states=states, attacks=attacks, seed=seed,
-            state_folder=folder, kept_only=kept_only,
+            state_folder=folder, kept_only=kept_only, workers=workers,
         )  # fmt: skip
     click.echo(json.dumps({name: asdict(row) for name, row in found.items()}, indent=2))
 

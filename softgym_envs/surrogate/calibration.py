@@ -174,6 +174,7 @@ def judged_states(
     seed: int,
     folder: str | Path | None = None,
     kept_only: bool = False,
+    workers: int = 1,
 ) -> JudgedStates:
     """Return FEM states of all strata of a model's robot.
 
@@ -184,20 +185,22 @@ def judged_states(
         seed: of the bodies and commands.
         folder: where the states of each body are kept; an interrupted run continues with the next body.
         kept_only: take what the folder holds, without solving the rest.
+        workers: number of processes that solve bodies.
     """
     parts = [
-        _drawn(model, stratum, bodies, states, seed, folder, kept_only)
+        _drawn(model, stratum, bodies, states, seed, folder, kept_only, workers)
         for stratum in strata_of(model.robot, buckles=model.domain.limits_growth)
     ]
     return JudgedStates.join(parts)
 
 
 def _drawn(
-    model: SurrogateModel, stratum: str, bodies: int, states: int, seed: int, folder: str | Path | None, kept_only: bool
-) -> JudgedStates:
+    model: SurrogateModel, stratum: str, bodies: int, states: int, seed: int,
+    folder: str | Path | None, kept_only: bool, workers: int,
+) -> JudgedStates:  # fmt: skip
     """Return FEM states of one stratum."""
     commands = draw_commands(model.robot, stratum, bodies, states, seed, softness(model), learned_bounds(model))
-    return solve_commands(model.robot, commands, folder=folder, kept_only=kept_only)
+    return solve_commands(model.robot, commands, folder=folder, kept_only=kept_only, workers=workers)
 
 
 def learned_bounds(model: SurrogateModel) -> dict[str, tuple[float, float]]:
@@ -307,7 +310,7 @@ def safe_limit(judged: Predictions, tolerance: float) -> float:
 
 def calibrate(
     folder: str | Path, robot: Robot, *, bodies: int = 64, states: int = 5, attacks: int = 500, seed: int = 11,
-    state_folder: str | Path | None = None, kept_only: bool = False,
+    state_folder: str | Path | None = None, kept_only: bool = False, workers: int = 1,
 ) -> dict[str, StratumReport]:  # fmt: skip
     """Calibrate the weights of a folder and write the result to their card.
 
@@ -321,6 +324,7 @@ def calibrate(
         state_folder: where the FEM states are kept, so that an interrupted run continues.
         kept_only: calibrate on the states that the folder holds, without solving the rest; only those of the search
             for the worst trusted ones are solved.
+        workers: number of processes that solve bodies.
 
     Returns:
         How the calibrated model does on the calibration states, by stratum; ``adversarial`` for those of the search.
@@ -336,11 +340,11 @@ def calibrate(
         )
     if model.card.get("calibration", {}).get("limits_growth"):  # the last calibration did, not the training
         model = with_domain(model, growth=np.inf)
-    known = judged_states(model, bodies, states, seed, state_folder, kept_only)
+    known = judged_states(model, bodies, states, seed, state_folder, kept_only, workers)
     limits_growth = False
     if not model.domain.limits_growth and (growth := usual_growth(model, known)) is not None:
         limits_growth, model = True, with_domain(model, growth=growth)
-        softest = _drawn(model, "near buckling", bodies, states, seed, state_folder, kept_only)
+        softest = _drawn(model, "near buckling", bodies, states, seed, state_folder, kept_only, workers)
         known = JudgedStates.join([known, softest])
     calibration = fit_calibration(model, known)
     unlimited, everything = _calibrated(model, calibration), known
@@ -348,7 +352,8 @@ def calibrate(
     limit = safe_limit(predict(unlimited, known), robot.goal_tolerance)
     while attacks and len(limits) < SEARCHES and (not limits or limit < (1.0 - ROUNDING) * limits[-1]):
         limits.append(limit)
-        found_states = attack(_calibrated(model, calibration, limit), attacks, states, seed, state_folder, len(limits))
+        limited = _calibrated(model, calibration, limit)
+        found_states = attack(limited, attacks, states, seed, state_folder, len(limits), workers)
         everything = JudgedStates.join([everything, found_states])
         limit = safe_limit(predict(unlimited, everything), robot.goal_tolerance)
     model = _calibrated(model, calibration, limit)
@@ -416,8 +421,9 @@ def calibration_states(model: SurrogateModel, folder: str | Path) -> JudgedState
 
 
 def attack(
-    model: SurrogateModel, count: int, states: int, seed: int, folder: str | Path | None = None, number: int = 0
-) -> JudgedStates:
+    model: SurrogateModel, count: int, states: int, seed: int,
+    folder: str | Path | None = None, number: int = 0, workers: int = 1,
+) -> JudgedStates:  # fmt: skip
     """Search for trusted states with large errors; return all that were judged, in the stratum ``adversarial``.
 
     In each of `ROUNDS` rounds, gradients of the spread move bodies and commands from anywhere in the box of trust to
@@ -431,6 +437,7 @@ def attack(
         seed: of the random numbers.
         folder: where the states of each body are kept; an interrupted search continues with the next body.
         number: of the search: each has random numbers of its own.
+        workers: number of processes that solve bodies.
     """
     rng = np.random.default_rng([seed, 99 + number])
     robot = model.robot
@@ -457,7 +464,8 @@ def attack(
             )
         designs = _designs(model, x)
         command = robot.displacements(c.reshape(-1, n)).reshape(c.shape)
-        found = solve_commands(robot, Commands(np.full(len(x), "adversarial"), designs, command), folder=folder)
+        searched = Commands(np.full(len(x), "adversarial"), designs, command)
+        found = solve_commands(robot, searched, folder=folder, workers=workers)
         parts.append(found)
         judged = predict(model, found)
         error = np.where(judged.found & judged.trusted, judged.error, 0.0)

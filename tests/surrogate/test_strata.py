@@ -205,6 +205,18 @@ def test_an_interrupted_run_continues_with_the_next_body(tmp_path, monkeypatch):
     assert (solve_commands(robot, other, folder=tmp_path).command == other.command[0]).all() and solved == [0]
 
 
+def test_several_processes_solve_the_same_states(tmp_path):
+    robot = make_robot("trunk")
+    commands = draw_commands(robot, "inside", 3, 2)
+    alone, together = (solve_commands(robot, commands, folder=tmp_path / str(n), workers=n) for n in (1, 2))
+    for name, values in vars(alone).items():
+        other = vars(together)[name]
+        if values.dtype.kind == "f":  # their last digits depend on where arrays lie in memory
+            np.testing.assert_allclose(other, values, rtol=1e-6, atol=1e-12)
+        else:
+            np.testing.assert_array_equal(other, values)
+
+
 def test_states_that_touch_are_marked():
     wall = {"kind": "plane", "point": [0.0, 0.045, 0.0], "normal": [0.0, -1.0, 0.0]}
     robot = make_robot("finger", obstacles=[wall])

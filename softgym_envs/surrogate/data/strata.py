@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from softgym_envs.errors import ConvergenceError, DataError, InfeasibleDesign
+from softgym_envs.executors import parallel_map
 from softgym_envs.mechanics.solvers.equilibrium import Equilibrium
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import Robot
@@ -206,6 +207,7 @@ def solve_commands(
     second_start: bool = False,
     folder: str | Path | None = None,
     kept_only: bool = False,
+    workers: int = 1,
 ) -> JudgedStates:
     """Return the FEM equilibria under commands; bodies that are infeasible or have no state at rest are left out.
 
@@ -219,25 +221,34 @@ def solve_commands(
         second_start: also solve each command from rest.
         folder: where the states of each body are kept, so that an interrupted run continues with the next body.
         kept_only: leave out bodies whose states are not in the folder, instead of solving them.
+        workers: number of processes that solve bodies.
 
     Raises:
         DataError: if no body is left then.
     """
-    parts = []
+    parts: dict[int, JudgedStates] = {}
+    missing = []
     for number in range(len(commands.design)):
         path = None if folder is None else Path(folder) / f"{_key(robot, commands, number, second_start)}.npz"
         if path is not None and path.exists():
-            part = JudgedStates.load(path)
-        elif kept_only:
-            continue
+            parts[number] = JudgedStates.load(path)
         else:
-            part = _solve_body(robot, commands, number, second_start)
-            if path is not None:
-                part.save(path)
-        parts.append(part)
+            missing.append((robot, commands, number, second_start, path))
+    if not kept_only:
+        parts |= parallel_map(_solve_and_keep, missing, workers)
     if not parts:
         raise DataError(f"'{folder}' holds no states of the stratum '{commands.stratum[0]}' with these commands")
-    return JudgedStates.join(parts)
+    return JudgedStates.join([parts[number] for number in sorted(parts)])
+
+
+def _solve_and_keep(
+    robot: Robot, commands: Commands, number: int, second_start: bool, path: Path | None
+) -> tuple[int, JudgedStates]:
+    """Return the number of a body and its states, and write them to a file."""
+    part = _solve_body(robot, commands, number, second_start)
+    if path is not None:
+        part.save(path)
+    return number, part
 
 
 def _key(robot: Robot, commands: Commands, number: int, second_start: bool) -> str:
