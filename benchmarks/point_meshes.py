@@ -10,7 +10,7 @@ from dataclasses import asdict, replace
 
 import numpy as np
 
-from benchmarks.convergence import MM, STUDIES, measure
+from benchmarks.convergence import MM, STUDIES, Study, measure
 from softgym_envs.robots.base import Robot
 from softgym_envs.robots.registry import make_robot
 
@@ -20,10 +20,20 @@ SIZE = 10.0 * MM
 SMALLEST = 1.0 * MM
 """Smallest edge length of the small elements; otherwise it is half the guide radius."""
 
+STUDIED: dict[str, Study] = STUDIES | {
+    "two_finger_gripper_taut": replace(
+        STUDIES["two_finger_gripper"], command=(10.0 * MM, 8.0 * MM, 8.0 * MM, 10.0 * MM)
+    )
+}
+"""Studies of convergence, and one whose finer mesh takes too long."""
+
 CASES = (
     ("finger", 1.0 * MM),
+    ("finger", 3.0 * MM),
     ("finger_sideways", 1.0 * MM),
+    ("finger_sideways", 3.0 * MM),
     ("finger_1cable", 1.0 * MM),
+    ("finger_1cable", 3.0 * MM),
     ("two_finger_gripper", 1.0 * MM),
     ("two_finger_gripper", 2.0 * MM),
     ("two_finger_gripper", 3.0 * MM),
@@ -35,7 +45,7 @@ CASES = (
 
 def robots_of(name: str, radius: float) -> tuple[Robot, Robot]:
     """Return the robot of a study with a guide radius [m], and the same with smaller elements where loads act."""
-    study = STUDIES[name]
+    study = STUDIED[name]
     options = {"mesh": "accurate", "mesh_size": SIZE, "guide_radius": radius, **study.options}
     plain, small = (make_robot(study.robot, **options) for _ in range(2))
     finger = getattr(small, "finger", small)
@@ -48,7 +58,7 @@ def point_meshes() -> dict[str, object]:
     rows = []
     for name, radius in CASES:
         before, level = (
-            measure(robot, robot.design_space.baseline, "baseline", "accurate", STUDIES[name])
+            measure(robot, robot.design_space.baseline, "baseline", "accurate", STUDIED[name])
             for robot in robots_of(name, radius)
         )
         tip = np.array(before.tip)

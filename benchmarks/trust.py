@@ -19,18 +19,14 @@ SEED = 12
 BODIES, ATTACKS = 16, 2000
 """Most bodies of a stratum, and states of the search. Rows recorded earlier have up to 32 bodies."""
 
-FEWER_ATTACKS = {"three_finger_gripper": 500}
-"""States of the search of weights with a smaller one."""
-
 
 def trust(variant: str, folder: str | Path = "results/trust") -> dict[str, object]:
     """Errors, coverage and trust of weights by stratum, on FEM states that their calibration has not seen.
 
-    As many states as the calibration used, but at most those of `BODIES` bodies, and `ATTACKS` (or `FEWER_ATTACKS`) of
-    a new search for trusted states with large errors (``adversarial``), with the limit of trust as it is. States of an
-    accurate mesh take many seconds, so there the states of the calibration serve again, if the folder has them: those
-    of each body are judged by factors and a limit of trust from all others, and ``adversarial`` is the search of the
-    calibration.
+    As many states as the calibration used, but at most those of `BODIES` bodies, and `ATTACKS` of a new search for
+    trusted states with large errors (``adversarial``), with the limit of trust as it is. States of an accurate mesh
+    take many seconds, so there the states of the calibration serve again, if the folder has them: those of each body
+    are judged by factors and a limit of trust from all others, and ``adversarial`` is the search of the calibration.
 
     Args:
         variant: name of shipped weights that have been calibrated.
@@ -43,7 +39,7 @@ def trust(variant: str, folder: str | Path = "results/trust") -> dict[str, objec
     if expensive := "mesh" in robot.mechanics_key:
         rows = cross_validated(model, calibration_states(model, kept))
     else:
-        attacked = attack(model, FEWER_ATTACKS.get(variant, ATTACKS), sizes["states"], SEED, kept)
+        attacked = attack(model, ATTACKS, sizes["states"], SEED, kept)
         states = judged_states(model, min(sizes["bodies"], BODIES), sizes["states"], SEED, kept)
         rows = report(model, states) | {"adversarial": report(model, attacked)["adversarial"]}
     result: dict[str, object] = {
