@@ -27,7 +27,6 @@ REWRITTEN = {
     "benchmarks/data/recorded.json zigzag_robust",
     "codesign/benchmark/data/references/cable-trunk-reach-v2.json found",
     "softgym_envs/surrogate/chain/weights/contact_aided_finger/model.json provenance",
-    "softgym_envs/surrogate/weights/finger_2cables_accurate/model.json provenance",
     "softgym_envs/surrogate/weights/sensorized_finger_2cavities_touched/model.json provenance",
 }
 """What comes from a commit that was rewritten before it landed, or had uncommitted changes.
