@@ -37,7 +37,7 @@ def _relax_dynamically(model: MechanicalModel, statics: Statics, command: np.nda
 
 
 class FEMBackend(Backend):
-    """States from finite elements: static equilibria with exact ``W``, or motion in time.
+    """States from finite elements: static equilibria with exact ``W``, computed when it is read, or motion in time.
 
     An actuator whose effort would exceed its ``max_effort`` is driven by that effort instead, until its command asks
     for less.

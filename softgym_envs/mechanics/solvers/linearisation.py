@@ -101,8 +101,8 @@ class Linearisation:
         """Whether the factorised tangent is positive definite, and will be after the last small corrections.
 
         The response to a random load grows without bound as any eigenvalue nears zero. It is compared with that of the
-        first tangent. Next to the point where a gripper buckles, after steps of up to half of the pull, corrections
-        have made tangents indefinite whose response was at least 17 times as large.
+        first tangent. Next to the points where grippers buckle, after steps of up to half of the pull, tangents that
+        the last corrections made indefinite had at least 17 times that response.
         """
         if not self.positive_definite or self.first_response is None:
             return False
