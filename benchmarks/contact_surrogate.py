@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from softgym_envs.surrogate.chain.model import ChainModel
 
 INCREMENTS = 12
-MOST_DRAWS = 3000
+MAX_DRAWS = 3000
 """Scenes that are drawn before giving up on one."""
 GAPS = (1.0e-4, 2.5e-4)
 """Distance of a further bar from the bent finger [m]: half of the distance of contact and less."""
@@ -78,7 +78,7 @@ def draw_scene(model: ChainModel, contacts: int, rng: np.random.Generator) -> Sc
     from softgym_envs.surrogate.chain.contact import ChainBatch
 
     corners = slice(1, 2 + model.chain.points)
-    for _ in range(MOST_DRAWS):
+    for _ in range(MAX_DRAWS):
         row = _draw_body(model, rng)
         if row is None:
             continue

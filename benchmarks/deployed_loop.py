@@ -29,7 +29,7 @@ PERIOD = 0.01
 PUBLISHED_PERIOD = 0.24
 """Time of a step of the published simulation [s]."""
 
-MOST_CORRECTIONS = 6000
+MAX_CORRECTIONS = 6000
 STIFFER = 1.2
 """The plant's moduli over those of the model."""
 
@@ -99,7 +99,7 @@ def converge(step: Step, plant: Backend, goal: np.ndarray) -> tuple[int | None, 
         Corrections until the tolerance is kept (None if it never is), last error [m], median time of a correction [s].
     """
     state, times, inside = plant.reset(), [], 0
-    for k in range(MOST_CORRECTIONS):
+    for k in range(MAX_CORRECTIONS):
         measured = state.effector[0]
         began = time.process_time()
         command = step(goal, measured)

@@ -59,7 +59,7 @@ class BoTorchOptimiser(OptunaOptimiser):
 CHALLENGERS = 1_000
 """Bodies among which SMAC3 looks for the most promising one."""
 
-MOST_LEAVES = 1_024
+MAX_LEAVES = 1_024
 """Largest number of leaves in a tree of SMAC3, more than a search has bodies."""
 
 
@@ -150,7 +150,7 @@ class SmacOptimiser:
                 ratio_features=1.0,
                 min_samples_split=2,
                 min_samples_leaf=1,
-                max_leaf_nodes=MOST_LEAVES,
+                max_leaf_nodes=MAX_LEAVES,
                 log_y=True,
                 n_jobs=1,
                 seed=seed,

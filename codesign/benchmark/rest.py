@@ -23,7 +23,7 @@ LONGEST = 0.1
 SETTLED = 3e-3
 """Step of all commands, relative to their ranges, below which a body counts as at rest."""
 
-MOST_STEPS = 25
+MAX_STEPS = 25
 """Largest number of steps towards rest."""
 
 
@@ -40,7 +40,7 @@ def settle(env: SoftRobotVectorEnv, goals: np.ndarray, longest: float = LONGEST)
     """
     span = env.robot.upper - env.robot.lower
     controller = InverseQP.for_robot(env.robot, goal_weights=env.task.axes, rates=longest * span)
-    for steps in range(1, MOST_STEPS + 1):  # noqa: B007 - returned
+    for steps in range(1, MAX_STEPS + 1):  # noqa: B007 - returned
         command = controller.solve_batch(env.condensed, goals, env.command, env.slack)
         change = np.abs(command - env.command).max(axis=0) / span
         env.backend.step(command)
@@ -84,7 +84,7 @@ def settle_on_fem(
         for place in _tour(commands / span):
             goal, command = goals[place], commands[place]
             state = env.backend.step(command)
-            for _ in range(MOST_STEPS):
+            for _ in range(MAX_STEPS):
                 following = controller.solve(state.condensed, goal, command, state.slack)
                 change, command = np.abs(following - command) / span, following
                 state = env.backend.step(command)

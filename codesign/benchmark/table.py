@@ -40,7 +40,7 @@ FEW = 2
 """How many goals, from the first on, judges with ``_few`` in their names score. They are for accurate finite elements,
 which take 35 to 60 CPU s a body on the 12 goals of the finger, and they are compared with ``rest_few``."""
 
-FEWEST_RANKED, MOST_RESAMPLED = 10, 256
+FEWEST_RANKED, MAX_RESAMPLED = 10, 256
 """Smallest number of bodies whose ranking by two judges is compared, and largest whose tau has an interval."""
 
 BEST_SHARE = 0.1
@@ -59,7 +59,7 @@ class Agreement:
         bodies: how many both have scored.
         tau: Kendall's tau of their mean distances; NaN for fewer than three bodies.
         interval: 95 % interval of tau by a bootstrap over the bodies; NaN for fewer than `FEWEST_RANKED` bodies, and
-            for more than `MOST_RESAMPLED`, where it is narrower than +-0.1.
+            for more than `MAX_RESAMPLED`, where it is narrower than +-0.1.
         bias: mean of the distances [m] of the second judge minus those of the first.
     """
 
@@ -166,7 +166,7 @@ class Table:
             return float(kendalltau(x, y).statistic)
 
         interval = (np.nan, np.nan)
-        if FEWEST_RANKED <= count <= MOST_RESAMPLED:
+        if FEWEST_RANKED <= count <= MAX_RESAMPLED:
             drawn = bootstrap(pair, tau, paired=True, vectorized=False, n_resamples=2000, method="percentile", rng=0)
             interval = float(drawn.confidence_interval.low), float(drawn.confidence_interval.high)
         return Agreement(count, tau(*pair), interval, float(np.mean(pair[1] - pair[0])))

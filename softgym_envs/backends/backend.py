@@ -44,7 +44,7 @@ class State:
         effort: actuator efforts [N, ...], shape (n_a,).
         effector: effector positions [m], shape (k, 3).
         slack: which actuators are slack, shape (n_a,).
-        condensed: condensed model at the state; learned models, and FEM in contact, evaluate it when it is first read.
+        condensed: condensed model at the state; learned models and static FEM evaluate it when it is first read.
         row_effort: efforts of all rows of the body's model, bonds last, shape (size,); empty on the surrogate.
         velocity: effector velocities [m/s], shape (k, 3); zero without dynamics.
         motion: time, velocities and energies of the body; None without dynamics, and on the surrogate.

@@ -37,7 +37,7 @@ def _relax_dynamically(model: MechanicalModel, statics: Statics, command: np.nda
 
 
 class FEMBackend(Backend):
-    """States from finite elements: static equilibria with exact ``W``, or motion in time.
+    """States from finite elements: static equilibria with exact ``W``, computed when it is read, or motion in time.
 
     An actuator whose effort would exceed its ``max_effort`` is driven by that effort instead, until its command asks
     for less.
@@ -116,6 +116,7 @@ class FEMBackend(Backend):
             if self.robot.rest_mode == "effort" and model.loads.any():
                 # Loads would move the actuators, so they are held.
                 rest = statics.solve(zero)
+            rest = exact_at(statics, rest)
             self._dynamics = Dynamics(model, **self.step_options) if self.moving else None
             self.model, self._statics, self.design = model, statics, complete
             self._rest = self._state(rest, zero, still=True)
@@ -158,8 +159,8 @@ class FEMBackend(Backend):
         """Return the static solver of a body."""
         statics = Statics(model)
         linear, learned = statics.linearisation, any(block.learned for block in model.blocks)
-        # In contact, only W needs the last factorisation of a step: it is made when W is read.
-        statics.exact_compliance = linear.contact is None or linear.rubs or learned
+        # Only W needs the last factorisation of a step: it is made when W is read. Sensors are read with it.
+        statics.exact_compliance = linear.rubs or learned or "s" in dict(model.roles)
         return statics
 
     def _checked_friction(self, friction: float) -> float:
@@ -343,7 +344,6 @@ class FEMBackend(Backend):
         self, equilibrium: Equilibrium, command: np.ndarray, motion: Motion | None = None, *, still: bool = False
     ) -> State:
         condensed, slices, statics = equilibrium.condensed, equilibrium.condensed.slices, self._statics
-        exact = motion is not None or statics.exact_compliance
         effector = equilibrium.delta[slices["e"]].reshape(-1, 3)
         velocity = np.zeros_like(effector)
         if motion is not None and not still:
@@ -366,7 +366,9 @@ class FEMBackend(Backend):
             effort=equilibrium.effort[slices["a"]],
             effector=effector,
             slack=equilibrium.slack,
-            condensed=condensed if exact else (lambda: exact_at(statics, equilibrium).condensed),
+            condensed=condensed
+            if equilibrium.conditions is None
+            else (lambda: exact_at(statics, equilibrium).condensed),
             nodes=equilibrium.x,
             velocity=velocity,
             motion=motion,

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-MOST_STEPS = 10_000
+MAX_STEPS = 10_000
 """Largest number of time steps in a control step: more would run for minutes, and a unit is probably wrong."""
 
 
@@ -42,10 +42,10 @@ class TimeSteps:
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0.0):
                 raise ValueError(f"{name} = {value} s must be positive and finite")
-        if self.control_step > MOST_STEPS * self.time_step:
+        if self.control_step > MAX_STEPS * self.time_step:
             raise ValueError(
                 f"time_step = {self.time_step:g} s divides control_step = {self.control_step:g} s into more than "
-                f"{MOST_STEPS} steps; check their units"
+                f"{MAX_STEPS} steps; check their units"
             )
         for name in ("mass_damping", "stiffness_damping"):
             value = getattr(self, name)

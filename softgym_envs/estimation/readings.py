@@ -10,7 +10,7 @@ from softgym_envs.backends.backend import check_command
 from softgym_envs.robots.base import Robot
 from softgym_envs.wording import counted
 
-MOST_GROWTH = 10.0
+MAX_GROWTH = 10.0
 """Largest volume of a cavity that a reading may tell, in volumes at rest; also largest pressure of its air over that at
 rest. Neither occurs in a soft body, but both do in readings of a wrong unit."""
 
@@ -92,13 +92,13 @@ def checked_command(robot: Robot, values: np.ndarray) -> np.ndarray:
 
 def checked_volumes(values: np.ndarray | None, rest: np.ndarray) -> np.ndarray:
     """Return volumes [m3] of cavities with volumes at rest (k,), or a ValueError for malformed or impossible ones."""
-    return _within("volumes", checked_readings("volumes", values, len(rest)), 0.0 * rest, MOST_GROWTH * rest, "m3")
+    return _within("volumes", checked_readings("volumes", values, len(rest)), 0.0 * rest, MAX_GROWTH * rest, "m3")
 
 
 def checked_pressures(values: np.ndarray | None, ambient: np.ndarray) -> np.ndarray:
     """Return gauge pressures [Pa] of air sealed at ambient pressures (k,), or a ValueError, as `checked_volumes`."""
     checked = checked_readings("pressures", values, len(ambient))
-    return _within("pressures", checked, -ambient, (MOST_GROWTH - 1.0) * ambient, "Pa")
+    return _within("pressures", checked, -ambient, (MAX_GROWTH - 1.0) * ambient, "Pa")
 
 
 def _within(name: str, values: np.ndarray, low: np.ndarray, high: np.ndarray, unit: str) -> np.ndarray:

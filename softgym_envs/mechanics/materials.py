@@ -104,19 +104,23 @@ def _corotational(F, mu, lame, energy, stress, tangent):
         for k in range(9):
             r[k] = f[k]
         converged = False
+        change = np.inf
         for _ in range(40):
             d = _cofactor(r, c)
-            inverse_d = 1.0 / d
-            norm_r = 0.0
-            norm_i = 0.0
-            for k in range(9):
-                norm_r += r[k] * r[k]
-                norm_i += (c[k] * inverse_d) ** 2
-            ratio = norm_i / norm_r
-            # Scaling pays only far from a rotation; near one it costs two square roots for nothing.
-            scale = np.sqrt(np.sqrt(ratio)) if (ratio < 0.25 or ratio > 4.0) else 1.0
-            upscale = 0.5 * scale
-            downscale = 0.5 * inverse_d / scale
+            upscale = 0.5
+            downscale = 0.5 / d
+            # Scaling pays only far from a rotation; after a small change it costs two norms for nothing.
+            if change > 1e-2:
+                norm_r = 0.0
+                norm_i = 0.0
+                for k in range(9):
+                    norm_r += r[k] * r[k]
+                    norm_i += c[k] * c[k]
+                ratio = norm_i / (norm_r * d * d)
+                if ratio < 0.25 or ratio > 4.0:
+                    scale = np.sqrt(np.sqrt(ratio))
+                    upscale *= scale
+                    downscale /= scale
             change = 0.0
             for k in range(9):
                 new = upscale * r[k] + downscale * c[k]

@@ -34,7 +34,7 @@ TOUCHING = 1e-3
 TOLERANCE = 1e-8
 """Largest remaining correction of a node at an equilibrium [m]."""
 
-MOST_ITERATIONS = 1500
+MAX_ITERATIONS = 1500
 """Newton iterations after which a grasp gives up; 40 angles usually take fewer than 250."""
 
 
@@ -200,8 +200,8 @@ def evaluate_grasp(
                 break
             assert found.contacts is not None
             steps.append(_Step(theta, found.effort[0], found.contacts, found.iterations))
-            if theta < angle and sum(step.iterations for step in steps) > MOST_ITERATIONS:
-                raise ConvergenceError(f"more than {MOST_ITERATIONS} Newton iterations", fraction=theta / angle)
+            if theta < angle and sum(step.iterations for step in steps) > MAX_ITERATIONS:
+                raise ConvergenceError(f"more than {MAX_ITERATIONS} Newton iterations", fraction=theta / angle)
     except InfeasibleDesign as error:
         status, reason = "infeasible", str(error)
     except ConvergenceError as error:

@@ -66,7 +66,7 @@ SHAPES = {
 }
 """By the name of the module. A tube is drawn as a square bar around it, an accordion as one around its folds."""
 
-MOST_CELLS = 12
+MAX_CELLS = 12
 
 BODIES = ("superelements", "solid")
 
@@ -129,8 +129,8 @@ class ModularArm(Robot):
         **options: Any,
     ) -> None:
         if isinstance(cells, int) and not isinstance(cells, bool):
-            if not 1 <= cells <= MOST_CELLS:
-                raise ValueError(f"cells = {cells} is out of bounds; allowed: 1 to {MOST_CELLS}")
+            if not 1 <= cells <= MAX_CELLS:
+                raise ValueError(f"cells = {cells} is out of bounds; allowed: 1 to {MAX_CELLS}")
         elif not isinstance(cells, Sequence) or isinstance(cells, str) or not cells:
             raise ValueError(f"cells must be a number or a list of names, got {cells!r}; allowed: {', '.join(CELLS)}")
         elif unknown := [cell for cell in cells if cell not in CELLS]:

@@ -11,6 +11,7 @@ import pytest
 
 from softgym_envs import make_robot
 from softgym_envs.backends import make_backend
+from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.contact.obstacles import Plane
 from softgym_envs.mechanics.solvers.linearisation import Linearisation
 from softgym_envs.surrogate.potential.model import Model
@@ -71,6 +72,17 @@ def test_in_contact_finite_elements_compute_the_compliance_when_it_is_read(press
         np.testing.assert_allclose(state.effector, known.effector, rtol=0, atol=1e-9)
         scale = np.abs(known.condensed.compliance).max()
         np.testing.assert_allclose(state.condensed.compliance, known.condensed.compliance, rtol=0, atol=1e-6 * scale)
+
+
+@pytest.mark.parametrize("duplicate", [copy.copy, copy.deepcopy, lambda state: pickle.loads(pickle.dumps(state))])
+def test_copies_of_states_in_contact_hold_the_condensed_model(pressed, duplicate):
+    _, states = pressed()
+    assert callable(vars(states[0])["condensed"])
+    copied = [duplicate(state) for state in states]
+    assert all(isinstance(vars(state)["condensed"], CondensedModel) for state in copied)
+    for state, own in zip(copied, states, strict=True):
+        np.testing.assert_array_equal(state.condensed.compliance, own.condensed.compliance)
+        assert state.contacts.total == own.contacts.total
 
 
 def test_reading_the_compliance_does_not_disturb_the_next_step(pressed):

@@ -173,7 +173,7 @@ def test_a_finger_that_does_not_close_says_how_far_it_came(robot, closed, monkey
 
 def test_a_finger_that_closes_too_slowly_gives_up(robot, closed, monkeypatch):
     most = int(closed.iterations[:3].sum()) - 1
-    monkeypatch.setattr("softgym_envs.robots.grasping.MOST_ITERATIONS", most)
+    monkeypatch.setattr("softgym_envs.robots.grasping.MAX_ITERATIONS", most)
     found = evaluate_grasp(robot, {}, angles=8)
     assert found.status == "no equilibrium" and f"more than {most} Newton iterations" in found.reason
     assert len(found.angle) == 3

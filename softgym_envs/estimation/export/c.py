@@ -12,7 +12,7 @@ from softgym_envs.backends.surrogate import TOLERANCE
 from softgym_envs.estimation.estimator import IMPROBABLE
 from softgym_envs.estimation.learned import PLACES, STEP, LearnedEstimator
 from softgym_envs.estimation.loads import TouchGrid, cell_nodes
-from softgym_envs.estimation.readings import LARGEST_RESIDUAL, MOST_GROWTH
+from softgym_envs.estimation.readings import LARGEST_RESIDUAL, MAX_GROWTH
 from softgym_envs.storage import atomic_write
 from softgym_envs.surrogate.export.c_loads import loaded_text
 from softgym_envs.surrogate.export.c_text import check_identifier, comment, functions, names_of
@@ -136,7 +136,7 @@ def _header(estimator: LearnedEstimator, grid: TouchGrid, expected_force: float,
         "displacement_noise": noise.displacement,
         "expected_force": expected_force,
         "improbable": float(chi2.ppf(IMPROBABLE, k)),
-        "most_growth": MOST_GROWTH,
+        "most_growth": MAX_GROWTH,
         "unexplained": LARGEST_RESIDUAL**2 * k,
     }
     counts = {"most_steps": 26, "steps": estimator.steps, "knots": KNOTS}

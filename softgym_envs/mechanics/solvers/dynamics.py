@@ -302,7 +302,7 @@ class Dynamics(Statics):
         if not found.taken:
             return 0, None
         self.x, self.velocity, self.effort = found.x, found.velocity, found.effort
-        self._current_loads = loads
+        self.linearisation.loads = loads
         self.linearisation.current = False
         self.time += found.taken * self.step
         self._work += found.work
@@ -389,7 +389,7 @@ class Dynamics(Statics):
     @contextmanager
     def _inertia_added(self, inertia: Inertia) -> Iterator[None]:
         """Add inertia to the equilibrium, and apply dead loads in full: only statics ramps them."""
-        self._current_loads = self.linearisation.loads = self.model.loads
+        self.linearisation.loads = self.model.loads
         self.linearisation.inertia = inertia
         self.linearisation.current = False
         try:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypedDict
+from typing import NamedTuple, TypedDict
 
 import numpy as np
 
@@ -25,13 +25,26 @@ class NewtonFailure(Exception):
     """Newton's method did not converge on one increment; solvers catch it."""
 
 
+class Conditions(NamedTuple):
+    """What an equilibrium depends on besides its efforts.
+
+    Attributes:
+        loads: dead loads [N], shape (n, 3).
+        elasticity_version: that of the model.
+    """
+
+    loads: np.ndarray
+    elasticity_version: int
+
+
 @dataclass(frozen=True)
 class Equilibrium:
     """A solved state.
 
     Attributes:
         x: node positions [m], shape (n, 3).
-        condensed: the condensed model at the state; bonds are eliminated from it.
+        condensed: the condensed model at the state, or near it if there are ``conditions``; bonds are eliminated from
+            it.
         delta: constraint values of all rows, bonds last, shape (size,).
         effort: efforts of all rows, bonds last, shape (size,).
         slack: per actuator row, True where a unilateral actuator hangs slack.
@@ -41,6 +54,7 @@ class Equilibrium:
         increments: load increments used.
         contacts: where the body touches; None if it cannot.
         memory: what friction remembers, for `Statics.restore`; None without contact.
+        conditions: under which `exact_compliance.exact_at` computes the exact ``W``; None if it is exact.
     """
 
     x: np.ndarray
@@ -53,6 +67,7 @@ class Equilibrium:
     increments: int
     contacts: Contacts | None = None
     memory: ContactMemory | CableMemory | None = None
+    conditions: Conditions | None = None
 
 
 class AppliedLoads(TypedDict, total=False):
@@ -125,6 +140,7 @@ class RowLayout:
         symmetric: bool = True,
         contacts: Contacts | None = None,
         memory: ContactMemory | CableMemory | None = None,
+        conditions: Conditions | None = None,
     ) -> Equilibrium:
         """Return an equilibrium with its condensed model, from which bonds are eliminated.
 
@@ -140,6 +156,7 @@ class RowLayout:
             symmetric: whether ``W`` is symmetric: no point slides.
             contacts: as there.
             memory: as there.
+            conditions: as there.
         """
         count = len(effort) - self.bonds
         if self.bonds:
@@ -147,7 +164,9 @@ class RowLayout:
             if symmetric:
                 W = 0.5 * (W + W.T)
         condensed = CondensedModel(W, delta[:count] - W @ effort[:count], effort[:count], self.roles, self.labels)
-        return Equilibrium(x, condensed, delta, effort, slack, stable, iterations, increments, contacts, memory)
+        return Equilibrium(
+            x, condensed, delta, effort, slack, stable, iterations, increments, contacts, memory, conditions
+        )
 
 
 def checked(name: str, values: Sequence[float] | np.ndarray, count: int) -> np.ndarray:

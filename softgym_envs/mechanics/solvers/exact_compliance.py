@@ -19,16 +19,24 @@ def exact_at(statics: Statics, found: Equilibrium) -> Equilibrium:
 
     Raises:
         ConvergenceError: if the tangent is singular.
-        ValueError: if there is friction, whose tangent depends on what happened before the equilibrium.
+        ValueError: if the body has friction, whose tangent depends on what happened before the equilibrium, or if its
+            elasticity has changed since.
     """
-    linear = statics.linearisation
+    if found.conditions is None:
+        return found
+    linear, (loads, elasticity_version) = statics.linearisation, found.conditions
+    if elasticity_version != statics.model.elasticity_version:
+        raise ValueError("the elasticity of the body has changed since this equilibrium was found; solve for it again")
+    pairs = (found.x, statics.x), (found.effort, statics.effort), (loads, linear.loads)
+    if not all(np.array_equal(*pair) for pair in pairs):
+        linear = Linearisation(statics.model)
+        linear.loads = loads
     if linear.rubs:
         raise ValueError("a body with friction needs a solver with exact_compliance=True")
-    if not (np.array_equal(found.x, statics.x) and np.array_equal(found.effort, statics.effort)):
-        linear = Linearisation(statics.model)
     if not linear.update(found.x, found.effort, exact=True):
         raise ConvergenceError("the tangent of the equilibrium is singular", fraction=1.0)
     values = found.x, found.effort, linear.delta, linear.W, found.slack
     layout = RowLayout.of(statics.model)
     stable = linear.positive_definite
-    return replace(found, condensed=layout.equilibrium(*values, stable=stable, iterations=0).condensed, stable=stable)
+    condensed = layout.equilibrium(*values, stable=stable, iterations=0).condensed
+    return replace(found, condensed=condensed, stable=stable, conditions=None)

@@ -8,6 +8,8 @@ import numpy as np
 
 LARGEST_BEND = 0.05
 """Largest part of a first step that corrections may add; larger ones point to an event, such as a new contact."""
+SHORT_STEP = 0.05
+"""Steps of less than this part of Newton's count as short."""
 
 
 @dataclass(frozen=True)
@@ -37,13 +39,38 @@ class Bend:
         return factor**2 * self.corrections if alike else None
 
 
-def bend_of(change: np.ndarray, corrections: np.ndarray, size: float, straight: float) -> Bend | None:
-    """Return the bend of an increment, or None if an event has made it.
+@dataclass
+class Steps:
+    """The Newton steps of a load increment so far.
 
-    Args:
-        change: of the commands, shape (size,).
-        corrections: sum of all steps but the first, shape (N,).
-        size: largest displacement of the corrections [m].
+    Attributes:
+        corrections: sum of all steps of the equations but the first, shape (N,).
         straight: largest displacement of the first step [m], zero if it was cut.
+        norm: that of the last Newton step [m].
+        length: part of it that was taken.
+        short: number of short steps in a row.
     """
-    return Bend(change, corrections) if size <= LARGEST_BEND * straight else None
+
+    corrections: np.ndarray
+    straight: float = 0.0
+    norm: float = np.inf
+    length: float = 0.0
+    short: int = 0
+
+    def add(self, step: np.ndarray, norm: float, length: float, predicted: np.ndarray | None = None) -> None:
+        """Add the part ``length`` of a Newton step (N,) of size ``norm`` [m], and the corrections it predicted (N,)."""
+        if self.norm < np.inf:
+            self.corrections += length * step
+        elif length == 1.0:
+            self.straight = norm
+        if predicted is not None:
+            self.corrections += predicted
+        self.norm, self.length = norm, length
+        self.short = self.short + 1 if length < SHORT_STEP else 0
+
+    def bend(self, change: np.ndarray, size: float) -> Bend | None:
+        """Return the bend of an increment that changed commands (size,), or None if an event has made it.
+
+        ``size`` is the largest displacement of the corrections [m].
+        """
+        return Bend(change, self.corrections) if size <= LARGEST_BEND * self.straight else None

@@ -14,7 +14,7 @@ violation of driven rows. A barrier grows too fast for the monotonicity test.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -30,6 +30,7 @@ from softgym_envs.mechanics.solvers.complementarity import complementary_step, h
 from softgym_envs.mechanics.solvers.contact_rows import ContactRows
 from softgym_envs.mechanics.solvers.equilibrium import (
     CAUTIOUS,
+    Conditions,
     Equilibrium,
     NewtonFailure,
     RowLayout,
@@ -39,12 +40,13 @@ from softgym_envs.mechanics.solvers.equilibrium import (
     checked_modes,
 )
 from softgym_envs.mechanics.solvers.linearisation import Linearisation
-from softgym_envs.mechanics.solvers.prediction import Bend, bend_of
+from softgym_envs.mechanics.solvers.penalty import Penalty
+from softgym_envs.mechanics.solvers.prediction import Bend, Steps
 
-MOST_SIMPLIFIED = 3
+MAX_SIMPLIFIED = 3
 """Simplified Newton corrections that together take less time than a factorisation and what it needs."""
-SHORT_STEP, MOST_SHORT_STEPS = 0.05, 6
-"""In contact, an increment is divided after this number of steps in a row of less than this part of Newton's."""
+MAX_SHORT_STEPS = 6
+"""In contact, an increment is divided after this number of short steps in a row."""
 
 
 class Statics:
@@ -55,8 +57,9 @@ class Statics:
         tolerance: largest remaining correction of any node at convergence [m].
         max_iterations: limit of Newton iterations per load increment.
         max_halvings: the smallest load increment is ``0.5 ** max_halvings`` of the whole step.
-        exact_compliance: compute ``W`` and stability at each equilibrium. Otherwise they may be those of the last
-            iterate, which saves a factorisation; without friction, `exact_compliance.exact_at` computes them later.
+        exact_compliance: compute ``W`` at each equilibrium. Otherwise it may be that of the last iterate, which saves a
+            factorisation; without friction, `exact_compliance.exact_at` computes it later. In contact the same holds
+            for stability. Without, the factorisation is left out only far from where the body would buckle.
         compiled: solve bodies of beams in compiled code (`BeamMotion`) where that converges fast; it gives the same
             equilibria to the tolerance.
 
@@ -105,7 +108,7 @@ class Statics:
         """Go back to the undeformed shape with no effort. The equilibrium under loads is found by `solve`."""
         self.x = self.model.nodes.copy()
         self.effort = np.zeros(self._assembly.size)
-        self._current_loads = np.zeros_like(self.x)  # dead loads that the current state carries
+        self.linearisation.loads = np.zeros_like(self.x)
         self._remember(None)
 
     def restore(self, x: np.ndarray, effort: np.ndarray, *, memory: ContactMemory | CableMemory | None = None) -> None:
@@ -122,7 +125,7 @@ class Statics:
         check_shapes(x, effort, self.model.nodes.shape, self._assembly.size)
         self.x = x.copy()
         self.effort = effort.copy()
-        self._current_loads = self.model.loads
+        self.linearisation.loads = self.model.loads
         self._remember(memory)
 
     @property
@@ -222,7 +225,7 @@ class Statics:
             if not np.isfinite(norm):
                 raise NewtonFailure
             while True:
-                most = MOST_SIMPLIFIED if norm <= self._short_step and length == 1.0 else 0
+                most = MAX_SIMPLIFIED if norm <= self._short_step and length == 1.0 else 0
                 part = length * step_q
                 x = self.x + self._displacement(self.x, part)
                 effort = self.effort + length * step_effort
@@ -237,7 +240,7 @@ class Statics:
                     raise NewtonFailure
             self.x, self.effort = x, effort
             near = iteration > 1 and length == 1.0 and remaining <= self.tolerance  # to the last factorisation
-            if near and not self.exact_compliance and linear.positive_definite:
+            if near and not self.exact_compliance and linear.is_far_from_singular():
                 linear.follow(assembled)
                 return iteration
             if not linear.factorise(assembled, x, definite=definite):
@@ -255,73 +258,51 @@ class Statics:
 
         The first step adds what was corrected in the last increment, if that was alike.
         """
-        linear = self.linearisation
-        forced = np.setdiff1d(np.arange(len(target)), driven)
-        loose = np.zeros(len(target), dtype=bool)
-        loose[: self._actuators] = self.unilateral
-        weight = np.zeros(len(driven))
-
-        def violation(delta: np.ndarray) -> np.ndarray:
-            gap = (delta - target)[driven]
-            return np.abs(np.where(loose[driven], np.minimum(gap, 0.0), gap))
-
-        def penalty(delta: np.ndarray) -> float:
-            return float(weight @ violation(delta)) - float(target[forced] @ delta[forced])
-
-        change = target - self.effort
+        linear, change = self.linearisation, target - self.effort
         change[driven] = (target - linear.delta)[driven]
         last, self._bend = self._bend, None
         expected = None if last is None or linear.inertia is not None else last.expected(change)
-        straight, corrections, full, crawls, norm = 0.0, np.zeros(self.model.equations), False, 0, np.inf
+        penalty, steps = Penalty.of(target, driven, self.unilateral), Steps(np.zeros(self.model.equations))
         for iteration in range(self.max_iterations + 1):
             step_q, step_effort = self._correction(None, linear.delta, self.effort, target, driven)
-            previous, norm = norm, self._norm(step_q)
+            norm = self._norm(step_q)
             if not np.isfinite(norm):
                 raise NewtonFailure
-            if full and norm <= self.tolerance:
+            if steps.length == 1.0 and norm <= self.tolerance:
                 if not linear.exact and not self._linearise(exact=True):
                     raise NewtonFailure
-                self._bend = bend_of(change, corrections, self._norm(corrections), straight)
+                self._bend = steps.bend(change, self._norm(steps.corrections))
                 return iteration
             if norm > self._longest_step:
                 step_q = step_q * (self._longest_step / norm)
                 norm = self._longest_step
-            weight = np.maximum(weight, 1.5 * np.abs((self.effort + step_effort)[driven]) + 1e-9)
-            pull = linear.residual + linear.H @ self.effort  # derivative of the energy
-            slope = float((pull - linear.H[:, forced] @ target[forced]) @ step_q)
-            slope -= float(weight @ violation(linear.delta))
-            found, polished = None, norm**2 <= 1e2 * self.tolerance * self._longest_step
-            if iteration == 0 and expected is not None:
-                found = self._search(step_q + expected, step_effort, penalty, slope, shortest=1.0)
-                if found is None:
-                    expected = None
+            penalty.raise_weights(self.effort + step_effort)
+            slope = float((linear.residual + linear.H @ (self.effort - penalty.forced)) @ step_q)
+            slope -= float(penalty.weight @ penalty.violation(linear.delta))
+            found, taken, polished = None, step_q, norm**2 <= 1e2 * self.tolerance * self._longest_step
+            if expected is not None:
+                taken = step_q + expected
+                found = self._search(taken, step_effort, penalty, slope, shortest=1.0)
             if found is None:
                 # Sliding friction has no potential, so that a good step can climb: it is known by being shorter.
-                climbs = linear.sliding and slope > 0.0 and norm < 0.5 * previous
-                anyway = climbs or norm < self._round_off
+                climbs = linear.sliding and slope > 0.0 and norm < 0.5 * steps.norm
+                anyway, taken, expected = climbs or norm < self._round_off, step_q, None
                 found = self._search(step_q, step_effort, penalty, slope, anyway=anyway, tangent=not polished)
             if found is None:
                 raise NewtonFailure
             x, effort, assembled, length = found
-            full = length == 1.0
-            crawls = crawls + 1 if length < SHORT_STEP else 0
-            if crawls == MOST_SHORT_STEPS:
+            steps.add(step_q, norm, length, expected)
+            expected = None
+            if steps.short == MAX_SHORT_STEPS:
                 raise NewtonFailure
-            if iteration:
-                corrections += length * step_q
-            elif full:
-                straight = norm
-                if expected is not None:
-                    corrections += expected
             remaining = np.inf
-            if full and polished:
-                taken = step_q if expected is None or iteration else step_q + expected
+            if length == 1.0 and polished:
                 x, effort, assembled, added, remaining = self._polish(taken, x, effort, assembled, target, driven)
-                corrections += added
+                steps.corrections += added
             self.x, self.effort = x, effort
             if iteration and remaining <= self.tolerance and linear.exact and not self.exact_compliance:
                 linear.follow(assembled)
-                self._bend = bend_of(change, corrections, self._norm(corrections), straight)
+                self._bend = steps.bend(change, self._norm(steps.corrections))
                 return iteration + 1
             if not linear.factorise(assembled, x):
                 raise NewtonFailure
@@ -335,7 +316,7 @@ class Statics:
         assembled: Assembled,
         target: np.ndarray,
         driven: np.ndarray,
-        most: int = MOST_SIMPLIFIED,
+        most: int = MAX_SIMPLIFIED,
     ) -> tuple[np.ndarray, np.ndarray, Assembled, np.ndarray, float]:
         """Apply simplified Newton corrections, if they alone can reach the tolerance: this saves a factorisation.
 
@@ -372,7 +353,7 @@ class Statics:
         self,
         step_q: np.ndarray,
         step_effort: np.ndarray,
-        penalty: Callable[[np.ndarray], float],
+        penalty: Penalty,
         slope: float,
         *,
         shortest: float = 1e-6,
@@ -384,7 +365,7 @@ class Statics:
         Args:
             step_q: of the equations, shape (N,).
             step_effort: of the efforts, shape (size,).
-            penalty: function of the values of all constraints (size,) [J].
+            penalty: violation of the driven rows.
             slope: derivative of energy plus penalty at the start [J].
             shortest: smallest part of the step to try.
             anyway: accept any change of the energy, for steps that it cannot resolve.
@@ -396,7 +377,8 @@ class Statics:
         """
         linear = self.linearisation
         assert linear.contact is not None
-        before = linear.energy(self.x, linear.elastic + linear.contact.energy(self.x)) + penalty(linear.delta)
+        before = linear.energy(self.x, linear.elastic + linear.contact.energy(self.x))
+        before += penalty.value(linear.delta)
         length = 1.0
         while length >= shortest:
             x = self.x + self._displacement(self.x, length * step_q)
@@ -408,7 +390,7 @@ class Statics:
             barrier = linear.contact.energy(x)
             assembled = linear.assemble(x, effort, tangent=tangent) if np.isfinite(barrier) else None
             if assembled is not None:
-                after = linear.energy(x, assembled.energy + barrier) + penalty(assembled.delta)
+                after = linear.energy(x, assembled.energy + barrier) + penalty.value(assembled.delta)
                 after += linear.inertial_work(self.x, x)
                 if anyway or after <= before + 1e-4 * length * min(slope, 0.0) + 1e-12 * abs(before) + 1e-14:
                     return x, effort, assembled, length
@@ -481,9 +463,9 @@ class Statics:
         linear = self.linearisation
         if self._elasticity_version != self.model.elasticity_version:
             self._elasticity_version = self.model.elasticity_version
-            linear.current = False
-        loads, start_loads = self.model.loads, self._current_loads
-        linear.loads, ramped = start_loads, bool((loads != start_loads).any())
+            linear.current, linear.first_response = False, None
+        loads, start_loads = self.model.loads, linear.loads
+        ramped, carried = bool((loads != start_loads).any()), start_loads
         if not linear.current and not self._linearise():
             raise ConvergenceError("the starting state has inverted elements or a singular tangent", fraction=0.0)
 
@@ -504,7 +486,7 @@ class Statics:
             except BaseException as problem:
                 # After any exception, even Ctrl-C, the last equilibrium is restored.
                 self.x, self.effort = kept
-                linear.loads = self._current_loads
+                linear.loads = carried
                 linear.current = False
                 if not isinstance(problem, NewtonFailure):
                     raise
@@ -514,7 +496,7 @@ class Statics:
                     raise no_equilibrium(target, modes, done, reached) from None
                 continue
             increments += 1
-            done, self._current_loads = level, linear.loads
+            done, carried = level, linear.loads
             size *= 1.5
             found = self._state(target, driven, iterations, increments)
             if linear.rubs:
@@ -571,6 +553,7 @@ class Statics:
             symmetric=not linear.sliding,
             contacts=None if linear.contact is None else linear.contact.contacts(self.x),
             memory=self.memory,
+            conditions=None if linear.located else Conditions(linear.loads, self._elasticity_version),
         )
 
     # -- bodies of beams --------------------------------------------------------------------------------------------
@@ -587,7 +570,7 @@ class Statics:
     def _balance(self, goal: np.ndarray, driven: np.ndarray) -> Equilibrium | None:
         """Find the equilibrium for commanded rows (size,) in compiled code; None where the general solver is needed."""
         beams, loads = self.beam_solver(), self.model.loads
-        ramped = bool((loads != self._current_loads).any())
+        ramped = bool((loads != self.linearisation.loads).any())
         if beams is None or ramped or self.linearisation.inertia is not None or (driven >= self._actuators).any():
             return None
         found = beams.balance(self.x, self.effort, goal, driven, self.unilateral, loads=loads, tolerance=self.tolerance)
