@@ -282,6 +282,11 @@ class TestGroup:
         """Largest final distance of any seed [m]."""
         return max(evaluation.worst_distance for evaluation in self.evaluations)
 
+    @property
+    def largest_effort(self) -> float:
+        """Largest effort of any actuator in any episode of any seed [N, ...]; NaN if it is not known."""
+        return float(self.table("largest_efforts").max())
+
     def to_json(self) -> dict[str, Any]:
         """Return the average and the values of each seed as plain data."""
         data: dict[str, Any] = {"trial": self.trial, "agent": self.agent, "backend": self.backend, "goals": self.goals}

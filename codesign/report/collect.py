@@ -173,6 +173,7 @@ def _statistics(group: TestGroup, objective: Objective) -> BodyStatistics:
         mean_effort=mean.mean_effort,
         objective=group.value(objective.name),
         objective_interval=None if own is None else mean_interval(own),
+        largest_effort=none_for_nan(group.largest_effort),
     )
 
 
