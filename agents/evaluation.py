@@ -30,8 +30,8 @@ class Evaluation:
 
     Attributes:
         distances: effector to goal at the end of each episode [m], shape (n,).
-        mean_distances: mean of that distance over the steps of each episode [m], shape (n,); on a path, the tracking
-            error.
+        tracking_distances: mean of that distance over the steps of each episode [m], shape (n,); on a path, the
+            tracking error.
         returns: sum of rewards, shape (n,). Like the means over the steps, NaN if only the ends are known.
         successes: whether each episode ended within the task's success distance, shape (n,); in an average of several
             evaluations, the share that did.
@@ -48,7 +48,7 @@ class Evaluation:
     """
 
     distances: np.ndarray
-    mean_distances: np.ndarray
+    tracking_distances: np.ndarray
     returns: np.ndarray
     successes: np.ndarray
     efforts: np.ndarray
@@ -86,7 +86,7 @@ class Evaluation:
     @property
     def mean_tracking_distance(self) -> float:
         """Mean distance over all steps of an episode [m], averaged over the episodes."""
-        return float(self.mean_distances.mean())
+        return float(self.tracking_distances.mean())
 
     @property
     def mean_return(self) -> float:
@@ -130,6 +130,8 @@ class Evaluation:
             DataError: if a field is missing or not an array of numbers with a row for each goal.
         """
         try:
+            if "mean_distances" in data:  # as older files call it
+                data = {"tracking_distances": data["mean_distances"], **data}
             data = {**{name: np.full(np.size(data["distances"]), np.nan) for name in _LATER}, **data}
             columns = {name: _column(data[name]) for name in _PER_GOAL}
             cost = int(data["steps"]), float(data["seconds"]), float(data["cpu_seconds"])
@@ -159,7 +161,7 @@ def _column(values: Any) -> np.ndarray:
 
 _LATER = ("untrusted", "largest_efforts")
 """Columns that older files do not have."""
-_PER_GOAL = ("distances", "mean_distances", "returns", "successes", "efforts", "ends", *_LATER)
+_PER_GOAL = ("distances", "tracking_distances", "returns", "successes", "efforts", "ends", *_LATER)
 _SUMMARY = (
     "success_rate",
     "mean_distance",
@@ -367,7 +369,7 @@ def _run_episode(env: gymnasium.Env, act: Agent, seed: int, options: dict[str, A
         ended = terminated or truncated
     return {
         "distances": info["distance"],
-        "mean_distances": distance / steps,
+        "tracking_distances": distance / steps,
         "returns": total,
         "successes": bool(info["is_success"] and info["converged"]),
         "efforts": effort / steps,
@@ -410,7 +412,7 @@ def _evaluate_together(
         env.close()
     return Evaluation(
         distances=distances,
-        mean_distances=totals / lengths,
+        tracking_distances=totals / lengths,
         returns=returns,
         successes=successes,
         efforts=efforts / lengths,

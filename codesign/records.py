@@ -296,7 +296,7 @@ class TestGroup:
         data["values"] = {name: self.value(name) for name in self.tests[0].values}
         data |= {"unknowns": self.unknowns, "last_motion": self.last_motion}
         if len(self.tests) > 1:
-            names = ("distances", "mean_distances", "returns", "successes", "efforts", "ends")
+            names = ("distances", "tracking_distances", "returns", "successes", "efforts", "ends")
             data["seeds"] = [test.seed for test in self.tests]
             data["of_seeds"] = {name: none_for_nan(self.table(name)) for name in names}
         return data

@@ -83,7 +83,7 @@ def run_ends(
     unknown = np.full(len(points), np.nan)
     evaluation = Evaluation(
         distances=columns["distance"],
-        mean_distances=unknown,
+        tracking_distances=unknown,
         returns=unknown,
         successes=columns["success"],
         efforts=columns["effort"],

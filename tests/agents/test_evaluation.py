@@ -55,6 +55,8 @@ def test_files_from_before_trust_and_largest_efforts_were_recorded_can_be_read()
     for name in ("untrusted", "largest_efforts"):
         assert data.pop(name) == [None, None, None]
         assert np.isnan(getattr(Evaluation.from_json(data), name)).all()
+    distances = data["mean_distances"] = data.pop("tracking_distances")  # its earlier name
+    np.testing.assert_array_equal(Evaluation.from_json(data).tracking_distances, distances)
 
 
 @pytest.mark.parametrize("backend", ["surrogate", "fem"])  # together and one by one
@@ -130,7 +132,7 @@ def test_processes_share_goals_and_give_the_same_numbers(agent):
     environment = EnvironmentConfig(id="SoftGym/FingerReach-v0", backend="fem")
     goals = sample_goals(environment, 3, seed=5)
     one, two = (evaluate(agent, environment, goals, seed=1, workers=workers) for workers in (1, 2))
-    for name in ("distances", "mean_distances", "returns", "successes", "efforts", "ends"):
+    for name in ("distances", "tracking_distances", "returns", "successes", "efforts", "ends"):
         np.testing.assert_array_equal(getattr(two, name), getattr(one, name))
     assert two.steps == one.steps == 150 and two.cpu_seconds > 0.0
     assert len(set(one.returns)) == 3  # episodes differ
