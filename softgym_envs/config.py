@@ -293,7 +293,7 @@ _NOT_SOURCES = ("configs", "agents/results", "codesign/benchmark/data")
 def _source_hash() -> str:
     """Return a hash of the package's code, weights and meshes; it is the same in a checkout and in an installation."""
     root = Path(__file__).resolve().parent
-    files = {}
+    files: dict[str, Path] = {}
     for folder, inside, names in os.walk(root, followlinks=True):  # agents and codesign may be links
         place = Path(folder).relative_to(root)
         inside[:] = [name for name in inside if (place / name).as_posix() not in _NOT_SOURCES]
