@@ -10,7 +10,8 @@
 #   make test-clients           the snippets for other libraries, each in an environment of its own
 #
 # PYTHON=python3.12      use another interpreter (3.11 to 3.14; requirements.lock is made for 3.11)
-# PIP_ARGS="--extra-index-url https://download.pytorch.org/whl/cpu"    install the small torch without CUDA
+# TORCH_INDEX=           install the torch of PyPI, which has CUDA on Linux (several GB), where make finds no NVIDIA GPU
+# PIP_ARGS="--retries 9" pass more arguments to pip
 # ARGS="-k cable -x"     pass more arguments to pytest (make check, make test), softgym bench (make bench),
 #                        docs/make_images.py (make docs-images) or pip (make lock)
 
@@ -18,6 +19,8 @@ VENV ?= .venv
 WORKERS ?= 2
 DEMO ?= results/demo
 BIN := $(VENV)/bin
+# Torch without CUDA, for Linux without an NVIDIA GPU. With one, torch comes from pip's own index, like everything else.
+TORCH_INDEX ?= $(shell [ "$$(uname -s)" != Linux ] || nvidia-smi -L >/dev/null 2>&1 || echo https://download.pytorch.org/whl/cpu)
 SUPPORTED := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 15))
 PYTHON ?= $(shell for python in python3.11 python3 python3.12 python3.13 python3.14; do \
 	$$python -c '$(SUPPORTED)' 2>/dev/null && echo $$python && break; done)
@@ -49,6 +52,9 @@ setup: $(VENV)/.stamp-system
 $(VENV)/.stamp: requirements.lock pyproject.toml
 	@test -n "$(PYTHON)" || { echo "setup: no Python 3.11 to 3.14 found; name one with PYTHON=..." >&2; exit 1; }
 	$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv $(VENV)
+	@test -z "$(TORCH_INDEX)" || $(BIN)/python -m pip install --no-deps --retries 2 --timeout 15 $(PIP_ARGS) \
+		--index-url $(TORCH_INDEX) $$(grep '^torch==' requirements.lock) \
+		|| echo "setup: no torch from $(TORCH_INDEX); pip takes that of its own index, on Linux several GB with CUDA" >&2
 	$(BIN)/python -m pip install $(PIP_ARGS) -r requirements.lock
 	$(BIN)/python -m pip install --no-deps --no-build-isolation -e .
 	@touch $@

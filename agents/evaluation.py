@@ -30,8 +30,8 @@ class Evaluation:
 
     Attributes:
         distances: effector to goal at the end of each episode [m], shape (n,).
-        mean_distances: mean of that distance over the steps of each episode [m], shape (n,); on a path, the tracking
-            error.
+        tracking_distances: mean of that distance over the steps of each episode [m], shape (n,); on a path, the
+            tracking error.
         returns: sum of rewards, shape (n,). Like the means over the steps, NaN if only the ends are known.
         successes: whether each episode ended within the task's success distance, shape (n,); in an average of several
             evaluations, the share that did.
@@ -41,24 +41,28 @@ class Evaluation:
         steps: environment steps.
         untrusted: share of the steps of each episode that ended in a state which is not to be trusted (``trusted`` of
             ``info``), shape (n,); NaN if it is not known.
+        largest_efforts: largest effort of any actuator in any step of each episode [N, ...], shape (n,); NaN if it is
+            not known.
         seconds: wall-clock time [s].
         cpu_seconds: CPU time of this process [s].
     """
 
     distances: np.ndarray
-    mean_distances: np.ndarray
+    tracking_distances: np.ndarray
     returns: np.ndarray
     successes: np.ndarray
     efforts: np.ndarray
     ends: np.ndarray
     steps: int
     untrusted: np.ndarray | None = None
+    largest_efforts: np.ndarray | None = None
     seconds: float = 0.0
     cpu_seconds: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.untrusted is None:
-            object.__setattr__(self, "untrusted", np.full(len(self), np.nan))
+        for name in _LATER:
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, np.full(len(self), np.nan))
 
     def __len__(self) -> int:
         """Number of goals."""
@@ -82,7 +86,7 @@ class Evaluation:
     @property
     def mean_tracking_distance(self) -> float:
         """Mean distance over all steps of an episode [m], averaged over the episodes."""
-        return float(self.mean_distances.mean())
+        return float(self.tracking_distances.mean())
 
     @property
     def mean_return(self) -> float:
@@ -126,7 +130,9 @@ class Evaluation:
             DataError: if a field is missing or not an array of numbers with a row for each goal.
         """
         try:
-            data = {"untrusted": np.full(np.size(data["distances"]), np.nan), **data}  # older files do not have it
+            if "mean_distances" in data:  # as older files call it
+                data = {"tracking_distances": data["mean_distances"], **data}
+            data = {**{name: np.full(np.size(data["distances"]), np.nan) for name in _LATER}, **data}
             columns = {name: _column(data[name]) for name in _PER_GOAL}
             cost = int(data["steps"]), float(data["seconds"]), float(data["cpu_seconds"])
         except (KeyError, TypeError, ValueError) as error:
@@ -153,7 +159,9 @@ def _column(values: Any) -> np.ndarray:
     return found.astype(float) if found.dtype == object else found
 
 
-_PER_GOAL = ("distances", "mean_distances", "returns", "successes", "efforts", "ends", "untrusted")
+_LATER = ("untrusted", "largest_efforts")
+"""Columns that older files do not have."""
+_PER_GOAL = ("distances", "tracking_distances", "returns", "successes", "efforts", "ends", *_LATER)
 _SUMMARY = (
     "success_rate",
     "mean_distance",
@@ -349,23 +357,25 @@ def _evaluate_one_by_one(
 def _run_episode(env: gymnasium.Env, act: Agent, seed: int, options: dict[str, Any]) -> dict[str, Any]:
     """Return what `Evaluation` says of one episode, by the names of its columns, and its steps."""
     observation, info = env.reset(seed=seed, options=options)
-    total, effort, distance, untrusted, steps, ended = 0.0, 0.0, 0.0, 0, 0, False
+    total, effort, largest, distance, untrusted, steps, ended = 0.0, 0.0, 0.0, 0.0, 0, 0, False
     while not ended:
         observation, reward, terminated, truncated, info = env.step(act(observation, env.unwrapped))
         total += float(reward)
-        effort += float(np.abs(info["effort"]).mean())
+        efforts = np.abs(info["effort"])
+        effort, largest = effort + float(efforts.mean()), max(largest, float(efforts.max()))
         distance += info["distance"]
         untrusted += not info["trusted"]
         steps += 1
         ended = terminated or truncated
     return {
         "distances": info["distance"],
-        "mean_distances": distance / steps,
+        "tracking_distances": distance / steps,
         "returns": total,
         "successes": bool(info["is_success"] and info["converged"]),
         "efforts": effort / steps,
         "ends": info["effector"],
         "untrusted": untrusted / steps,
+        "largest_efforts": largest,
         "steps": steps,
     }
 
@@ -381,7 +391,7 @@ def _evaluate_together(
         act: Callable[[np.ndarray], np.ndarray] = lambda observation: control()  # noqa: E731
     else:
         act = Policy(agent).begin()
-    distances, totals, returns, efforts, untrusted, lengths = np.zeros((6, count))
+    distances, totals, returns, efforts, largest, untrusted, lengths = np.zeros((7, count))
     successes, running, ends = np.zeros(count, dtype=bool), np.ones(count, dtype=bool), np.zeros((count, 3))
     try:
         observation, _ = env.reset(seed=seed, options={"design": design, "goal": goals})
@@ -392,7 +402,9 @@ def _evaluate_together(
             successes[running] = (last["is_success"] & last["converged"])[running]
             totals += running * last["distance"]
             returns += running * reward
-            efforts += running * np.abs(last["effort"]).mean(axis=1)
+            effort = np.abs(last["effort"])
+            efforts += running * effort.mean(axis=1)
+            largest = np.maximum(largest, running * effort.max(axis=1))
             untrusted += running & ~last["trusted"]
             lengths += running
             running &= ~(terminated | truncated)
@@ -400,11 +412,12 @@ def _evaluate_together(
         env.close()
     return Evaluation(
         distances=distances,
-        mean_distances=totals / lengths,
+        tracking_distances=totals / lengths,
         returns=returns,
         successes=successes,
         efforts=efforts / lengths,
         ends=ends,
         untrusted=untrusted / lengths,
+        largest_efforts=largest,
         steps=int(lengths.sum()),
     )

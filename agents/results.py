@@ -61,7 +61,7 @@ class StoredEvaluation(TypedDict):
     """An evaluation in a file of results: values for each goal, rounded, and the cost."""
 
     distances: list[float]
-    mean_distances: list[float]
+    tracking_distances: list[float]
     returns: list[float]
     successes: list[int]
     steps: int
@@ -123,7 +123,7 @@ class StoredRuns:
         Args:
             agent: name of a learner, or of a baseline, which has a single row.
             backend: ``"own"`` for that of the environment, or ``"fem"``.
-            column: ``"distances"``, ``"mean_distances"``, ``"returns"`` or ``"successes"``.
+            column: ``"distances"``, ``"tracking_distances"``, ``"returns"`` or ``"successes"``.
         """
         backend = self.environment.backend if backend == "own" else backend
         own = [run.evaluations for run in self.runs if run.learner == agent]
@@ -230,7 +230,7 @@ def summary(runs: list[StoredRuns]) -> list[Summary]:
         quantity = ("tracking_distance" if entry.follows else "distance") if metres else "relative_error"
         for backend in sorted({entry.environment.backend, "fem"}):
             for agent in AGENTS:
-                scores = entry.scores(agent, backend, "mean_distances" if entry.follows else "distances")
+                scores = entry.scores(agent, backend, "tracking_distances" if entry.follows else "distances")
                 successes = entry.scores(agent, backend, "successes")
                 if scores is None or successes is None:
                     continue
@@ -271,7 +271,7 @@ def _head(first: str, agents: Sequence[str]) -> list[str]:
 
 
 def _distance(entry: StoredRuns, agent: str, backend: str) -> str:
-    scores = entry.scores(agent, backend, "mean_distances" if entry.follows else "distances")
+    scores = entry.scores(agent, backend, "tracking_distances" if entry.follows else "distances")
     if scores is None:
         return ""
     scale = entry.environment.task_class.distance_scale

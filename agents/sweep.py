@@ -66,7 +66,7 @@ def _evaluations(
             )
             found[backend][name] = {
                 "distances": _short(outcome.distances),
-                "mean_distances": _short(outcome.mean_distances),
+                "tracking_distances": _short(outcome.tracking_distances),
                 "returns": _short(outcome.returns),
                 "successes": outcome.successes.astype(int).tolist(),
                 "steps": outcome.steps,

@@ -81,7 +81,7 @@ def train(
     may also be shortened, to any number of steps from where it stands. What a learner plans over all steps, such as its
     learning rate, is from then on that of a training of the new number of steps. Until the training ends, the folder
     keeps the previous policy, if there is one. ``provenance.json`` and the card list each change of the steps, and
-    other code (commit or versions) than began the training.
+    other code (sources or versions) than began the training.
 
     Args:
         config: configuration of the training.

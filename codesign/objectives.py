@@ -153,7 +153,9 @@ OBJECTIVES: dict[str, Objective] = {
         Objective("success_rate", lambda o: o.evaluation.successes, "Success rate", "%", 100.0, maximize=True),
         Objective("mean_distance", lambda o: o.evaluation.distances, "Mean final distance", "mm", 1e3),
         Objective("mean_return", lambda o: o.evaluation.returns, "Mean return", maximize=True),
-        Objective("mean_tracking_distance", lambda o: o.evaluation.mean_distances, "Mean tracking distance", "mm", 1e3),
+        Objective(
+            "mean_tracking_distance", lambda o: o.evaluation.tracking_distances, "Mean tracking distance", "mm", 1e3
+        ),
         Objective("mean_effort", lambda o: o.evaluation.efforts, "Mean actuator effort", "N"),
         Objective("untrusted_share", lambda o: o.evaluation.untrusted, "Share of untrusted states", "%", 100.0),
         Objective("material_volume", lambda o: o.model.volume, "Material volume", "cm3", 1e6, of_body=True),

@@ -131,6 +131,11 @@ class StudyProblem(Config):
         return self._find("mean_distance")
 
     @property
+    def effort(self) -> Objective:
+        """Mean effort of the actuators, in the unit that people read for the robot."""
+        return self._find("mean_effort")
+
+    @property
     def distance_scale(self) -> DistanceScale:
         """How people read a single distance of the task."""
         return self.environment.task_class.distance_scale

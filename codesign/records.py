@@ -282,6 +282,11 @@ class TestGroup:
         """Largest final distance of any seed [m]."""
         return max(evaluation.worst_distance for evaluation in self.evaluations)
 
+    @property
+    def largest_effort(self) -> float:
+        """Largest effort of any actuator in any episode of any seed [N, ...]; NaN if it is not known."""
+        return float(self.table("largest_efforts").max())
+
     def to_json(self) -> dict[str, Any]:
         """Return the average and the values of each seed as plain data."""
         data: dict[str, Any] = {"trial": self.trial, "agent": self.agent, "backend": self.backend, "goals": self.goals}
@@ -291,7 +296,7 @@ class TestGroup:
         data["values"] = {name: self.value(name) for name in self.tests[0].values}
         data |= {"unknowns": self.unknowns, "last_motion": self.last_motion}
         if len(self.tests) > 1:
-            names = ("distances", "mean_distances", "returns", "successes", "efforts", "ends")
+            names = ("distances", "tracking_distances", "returns", "successes", "efforts", "ends")
             data["seeds"] = [test.seed for test in self.tests]
             data["of_seeds"] = {name: none_for_nan(self.table(name)) for name in names}
         return data

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+import hashlib
+import os
 import platform
 import re
 import reprlib
@@ -282,8 +285,28 @@ def commit_of(root: Path) -> str | None:
     return None
 
 
+_NOT_SOURCES = ("configs", "agents/results", "codesign/benchmark/data")
+"""Folders of the package that results do not follow from: a run keeps its configuration, and the others are records."""
+
+
+@functools.cache
+def _source_hash() -> str:
+    """Return a hash of the package's code, weights and meshes; it is the same in a checkout and in an installation."""
+    root = Path(__file__).resolve().parent
+    files: dict[str, Path] = {}
+    for folder, inside, names in os.walk(root, followlinks=True):  # agents and codesign may be links
+        place = Path(folder).relative_to(root)
+        inside[:] = [name for name in inside if (place / name).as_posix() not in _NOT_SOURCES]
+        files |= {(place / name).as_posix(): Path(folder, name) for name in names}
+    digest = hashlib.sha256()
+    for name in sorted(files):
+        if name.endswith((".py", ".json", ".npz", ".safetensors")):
+            digest.update(f"{name}\0".encode() + hashlib.sha256(files[name].read_bytes()).digest())
+    return digest.hexdigest()[:12]
+
+
 def provenance() -> dict[str, Any]:
-    """Return the origin of a result: versions, git commit, time and machine."""
+    """Return the origin of a result: versions, git commit, hash of the package's sources, time and machine."""
     versions = {"softgym-envs": __version__, "python": platform.python_version()}
     for package in ("numpy", "scipy", "torch", "gymnasium", "stable-baselines3", "optuna", "gmsh", "proxsuite"):
         try:
@@ -293,6 +316,7 @@ def provenance() -> dict[str, Any]:
     commit = commit_of(Path(__file__).resolve().parent.parent)
     return {
         "commit": commit,
+        "sources": _source_hash(),
         "time": datetime.now(UTC).isoformat(timespec="seconds"),
         "platform": platform.platform(),
         "versions": versions,
@@ -302,10 +326,17 @@ def provenance() -> dict[str, Any]:
 def code_change(begun: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     """Return how the code differs between two of `provenance`: ``"begun with A; continued with B"``, or ``""``.
 
-    A commit or version that one of them does not know is no difference.
+    A commit, hash of the sources or version that one of them does not know is no difference. Commits whose sources are
+    equal differ in tests or documentation only, and are no difference either.
     """
-    before, after = ({"commit": made.get("commit"), **made.get("versions", {})} for made in (begun, now))
+    before, after = (
+        {**{key: made.get(key) for key in ("commit", "sources")}, **made.get("versions", {})} for made in (begun, now)
+    )
     changed = [name for name in before if None not in (before[name], after.get(name)) and before[name] != after[name]]
+    if "commit" in changed and "sources" in changed:
+        changed.remove("sources")
+    elif "commit" in changed and before["sources"] and after["sources"]:
+        changed.remove("commit")
     if not changed:
         return ""
     old, new = (", ".join(f"{name} {made[name]}" for name in changed) for made in (before, after))
@@ -329,6 +360,13 @@ def continue_with_code(folder: str | Path) -> str:
     if change and all(code_change(begun, other) != change for other in continued):
         write_json(path, {**begun, "continued": [*continued, now]})
     return change
+
+
+def code_changes(folder: str | Path) -> list[str]:
+    """Return each `code_change` that `continue_with_code` recorded in a results folder."""
+    path = Path(folder) / "provenance.json"
+    begun = read_json(path) if path.exists() else {}
+    return [code_change(begun, now) for now in begun.get("continued", [])]
 
 
 def save_resolved(folder: str | Path, config: Config) -> None:

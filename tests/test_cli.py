@@ -142,6 +142,7 @@ STRENGTH = "configs/design/finger_strength.yaml"
     [
         (["show", "octopus"], ["octopus", "finger"]),
         (["show", "finger", "--design", "length=1"], ["length", "0.038", "0.042"]),
+        (["show", "finger", "--design", "young_modulus=3"], ["young_modulus", "3 Pa", "1e+06 to 1e+07 Pa"]),
         (["show", "finger", "--design", "size=1"], ["size", "length"]),
         (["show", "finger", "--design", "length"], ["length", "name=value"]),
         (["show", "finger", "--option", "cables=9"], ["cables", "1, 2"]),

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from softgym_envs import config
 from softgym_envs.agents import EnvironmentConfig, TrainConfig
 from softgym_envs.config import (
     Config,
@@ -145,6 +146,39 @@ def test_code_that_changed_is_named_on_both_sides():
     assert code_change(begun, after) == (
         "begun with commit aaa, softgym-envs 0.1.0; continued with commit bbb, softgym-envs 0.2.0"
     )
+
+
+def test_commits_with_the_same_sources_are_no_change_of_code():
+    begun = {"commit": "aaa", "sources": "1", "versions": {"numpy": "2.1"}}
+    assert code_change(begun, {**begun, "commit": "bbb"}) == ""  # documentation or tests
+    other = {**begun, "sources": "2"}
+    assert code_change(begun, {**other, "commit": "bbb"}) == "begun with commit aaa; continued with commit bbb"
+    assert code_change(begun, other) == "begun with sources 1; continued with sources 2"  # of one dirty commit
+    assert code_change(begun, {**other, "commit": None}) == "begun with sources 1; continued with sources 2"
+    older = {"commit": "bbb", "versions": {"numpy": "2.1"}}  # a record without sources
+    assert code_change(older, begun) == "begun with commit bbb; continued with commit aaa"
+    assert code_change({**begun, "commit": "bbb"}, {**begun, "versions": {"numpy": "2.2"}}) == (
+        "begun with numpy 2.1; continued with numpy 2.2"
+    )
+
+
+def test_the_hash_of_the_sources_follows_code_and_weights_alone(tmp_path, monkeypatch):
+    root = tmp_path / "softgym_envs"
+    linked = tmp_path / "agents"  # as in a checkout
+    (root / "configs").mkdir(parents=True)
+    (linked / "results").mkdir(parents=True)
+    (root / "agents").symlink_to(linked)
+    monkeypatch.setattr(config, "__file__", str(root / "config.py"))
+
+    def hashed(path, text):
+        path.write_text(text)
+        return config._source_hash.__wrapped__()
+
+    first = hashed(root / "config.py", "a = 1")
+    for other in (root / "configs" / "x.json", linked / "results" / "y.json", linked / "notes.md"):
+        assert hashed(other, "new") == first
+    found = [hashed(root / "config.py", "a = 2"), hashed(linked / "learner.py", ""), hashed(root / "w.safetensors", "")]
+    assert len({first, *found}) == 4
 
 
 def test_continuing_with_other_code_is_recorded_once(tmp_path):

@@ -3,6 +3,7 @@
 import ast
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -105,6 +106,39 @@ def test_system_packages_are_the_same_everywhere():
     for name in ("Makefile", "Dockerfile", "docs/install.md"):
         words = (ROOT / name).read_text().replace("\\", " ").split()
         assert set(SYSTEM_PACKAGES.split()) <= {word.strip("`,;") for word in words}, name
+
+
+@pytest.mark.skipif(sys.platform != "linux" or shutil.which("make") is None, reason="needs make on Linux")
+@pytest.mark.parametrize(
+    ("gpu", "reached", "arguments", "tried"),
+    [
+        (False, True, [], True),
+        (False, False, [], True),  # the index of torch cannot be reached: pip's own index is left
+        (True, True, [], False),
+        (False, True, ["TORCH_INDEX="], False),
+    ],
+)
+def test_make_takes_torch_without_cuda_where_there_is_no_gpu(gpu, reached, arguments, tried, tmp_path):
+    def program(path, text):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(f"#!/bin/sh\n{text}\n")
+        path.chmod(0o755)
+
+    for name in ("Makefile", "requirements.lock", "pyproject.toml"):
+        shutil.copy(ROOT / name, tmp_path)
+    program(tmp_path / "bin" / "nvidia-smi", f"exit {0 if gpu else 9}")
+    refused = "" if reached else 'case "$*" in *--index-url*) exit 1;; esac'
+    program(tmp_path / "venv" / "bin" / "python", f'echo "$@" >> {tmp_path}/log; {refused}')
+    environment = {**os.environ, "PATH": f"{tmp_path / 'bin'}:{os.environ['PATH']}"}
+    environment = {name: value for name, value in environment.items() if name not in ("TORCH_INDEX", "MAKEFLAGS")}
+    command = ["make", "VENV=venv", "venv/.stamp", *arguments]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+    calls = (tmp_path / "log").read_text().splitlines()
+    torch = next(line for line in (ROOT / "requirements.lock").read_text().splitlines() if line.startswith("torch=="))
+    wanted = f"--index-url https://download.pytorch.org/whl/cpu {torch}"
+    assert [call.endswith(wanted) for call in calls if "--index-url" in call] == [True] * tried
+    assert calls[-2].endswith("-r requirements.lock") and calls[-1].endswith("-e .")
+    assert ("setup: no torch from" in done.stderr) == (not reached)
 
 
 def test_citation_and_version():

@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 import softgym_envs  # noqa: F401 - registers the environments
-from softgym_envs import make_robot
+from softgym_envs import DesignSpace, DesignVariable, make_robot
 from softgym_envs.agents.config import EnvironmentConfig, TrainConfig
 from softgym_envs.agents.evaluation import evaluate
 from softgym_envs.agents.policy import Policy
@@ -26,7 +26,10 @@ from softgym_envs.estimation.loads import Payload, Touch, finger_grid
 from softgym_envs.estimation.readings import Noise
 from softgym_envs.mechanics import MechanicalModel
 from softgym_envs.mechanics.builder import ModelBuilder
-from softgym_envs.robots import Actuator
+from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
+from softgym_envs.mechanics.constraints.point import Point
+from softgym_envs.mechanics.elements.beams import Section
+from softgym_envs.robots import Actuator, Robot
 from softgym_envs.surrogate.training import FitConfig
 from softgym_envs.testing import box_mesh
 
@@ -40,10 +43,28 @@ def body(nodes=NODES, **options):
     return MechanicalModel.from_mesh(nodes, TETRAHEDRA, fixed=nodes[:, 0] == 0.0, **options)
 
 
-def from_file(folder):
+def from_file(folder, **options):
     path = folder / "body.vtk"
     meshio.Mesh(1e3 * NODES, [("tetra", TETRAHEDRA)]).write(path)
-    return MechanicalModel.from_file(path, fixed_box=(-1.0, 1.0, -1.0, 1.0, -1.0, 1.0))
+    return MechanicalModel.from_file(path, fixed_box=(-1.0, 1.0, -1.0, 1.0, -1.0, 1.0), **options)
+
+
+class Leg(Robot):
+    """A beam whose design has its modulus in MPa, and forgets to convert it."""
+
+    name, effectors, size = "leg", ("tip",), 0.1
+    design_space = DesignSpace(DesignVariable("modulus", 10.0, 60.0, 35.0, "MPa", "stiffness of the leg"))
+    actuators = (Actuator("push", low=0.0, high=0.01, rate=0.001),)
+    effector_rest, effort_scale = np.array([0.1, 0.0, 0.0]), np.ones(1)
+
+    def assemble(self, design):
+        builder = ModelBuilder()
+        frames = [builder.add_frame([x, 0.0, 0.0], fixed=x == 0.0) for x in (0.0, 0.05, 0.1)]
+        builder.add_beam(frames, section=Section.circle(5e-3), young_modulus=design["modulus"], order=2)
+        model = builder.build()
+        for role, name in (("a", "push"), ("e", "tip")):
+            model.add(role, Point(name, EmbeddedPoints.in_frame(frames[-1], np.zeros(3), model.nodes)))
+        return model
 
 
 def carried(_):
@@ -123,6 +144,35 @@ MISTAKES = {
     "design in millimetres": (
         lambda _: reset(design={"length": 40.0}),
         "design variable 'length' = 40 m is out of bounds; allowed: 0.038 to 0.042 m",
+    ),
+    "design in megapascals": (
+        lambda _: make_robot("finger").build({"young_modulus": 3.0}),
+        "design variable 'young_modulus' = 3 Pa is out of bounds; allowed: 1e+06 to 1e+07 Pa",
+    ),
+    "design of an environment in megapascals": (
+        lambda _: gymnasium.make(REACH, design={"young_modulus": 3.0}),
+        "design variable 'young_modulus' = 3 Pa is out of bounds; allowed: 1e+06 to 1e+07 Pa",
+    ),
+    "design at a reset in megapascals": (
+        lambda _: reset(design={"young_modulus": 3.0}),
+        "design variable 'young_modulus' = 3 Pa is out of bounds; allowed: 1e+06 to 1e+07 Pa",
+    ),
+    "modulus in megapascals": (
+        lambda _: body(young_modulus=0.5),
+        "young_modulus = 0.5 Pa is less than 100 Pa, that of the softest gels; did you mean pascals? (for a value in "
+        "MPa pass 1e6 times it)",
+    ),
+    "modulus of a file in megapascals": (
+        lambda f: from_file(f, unit="mm", young_modulus=0.5),
+        "young_modulus = 0.5 Pa is less than 100 Pa, *",
+    ),
+    "modulus of one element in megapascals": (
+        lambda _: body(young_modulus=lambda x: np.where(x[:, 0] > x[:, 0].min(), 3e6, 3.0)),
+        "young_modulus = 3 Pa is less than 100 Pa, *",
+    ),
+    "modulus of a beam in megapascals": (
+        lambda _: Leg().build(),
+        "young_modulus = 35 Pa is less than 100 Pa, *",
     ),
     "Poisson's ratio in percent": (
         lambda _: body(poisson_ratio=45.0),

@@ -83,11 +83,12 @@ def run_ends(
     unknown = np.full(len(points), np.nan)
     evaluation = Evaluation(
         distances=columns["distance"],
-        mean_distances=unknown,
+        tracking_distances=unknown,
         returns=unknown,
         successes=columns["success"],
         efforts=columns["effort"],
         ends=columns["effector"],
+        largest_efforts=columns["largest"],
         steps=sum(each.equilibria for each in ended.values()),
         seconds=time.perf_counter() - began,
         cpu_seconds=time.process_time() - cpu,
@@ -156,13 +157,23 @@ class _End:
 
     distance: float
     success: bool
-    effort: float
+    efforts: np.ndarray
     effector: np.ndarray
     equilibria: int
     motion: float | None = None
 
+    @property
+    def effort(self) -> float:
+        """Mean effort of the actuators."""
+        return float(np.abs(self.efforts).mean())
 
-_COLUMNS = ("distance", "success", "effort", "effector")
+    @property
+    def largest(self) -> float:
+        """Largest effort of an actuator."""
+        return float(np.abs(self.efforts).max())
+
+
+_COLUMNS = ("distance", "success", "effort", "largest", "effector")
 
 
 def _settle(asked: _Questions) -> tuple[dict[int, _End], int]:
@@ -180,8 +191,7 @@ def _settle(asked: _Questions) -> tuple[dict[int, _End], int]:
                 found = settle(statics, robot, point, command)
         except ConvergenceError as error:
             raise asked.lost(k, error) from None
-        effort = float(np.abs(found.effort).mean())
-        ends[k] = _End(found.distance, found.distance < success, effort, found.effector, found.equilibria)
+        ends[k] = _End(found.distance, found.distance < success, found.effort, found.effector, found.equilibria)
     return ends, statics.model.equations
 
 
@@ -210,10 +220,9 @@ def _follow(asked: _Questions, agent: str | Path, last_steps: int) -> tuple[dict
             except ConvergenceError as error:
                 raise asked.lost(k, error) from None
             last = inner.backend.snapshot()
-            effort = float(np.abs(info["effort"]).mean())
             motion = float(np.linalg.norm(info["effector"] - before))
             distance, success = float(info["distance"]), bool(info["is_success"])
-            ends[k] = _End(distance, success, effort, info["effector"], 1 + last_steps, motion)
+            ends[k] = _End(distance, success, info["effort"], info["effector"], 1 + last_steps, motion)
         return ends, inner.backend.model.equations
     finally:
         env.close()

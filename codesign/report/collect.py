@@ -30,8 +30,7 @@ from softgym_envs.codesign.report.statistics import (
     rate_interval,
 )
 from softgym_envs.codesign.snapshot import StudySnapshot
-from softgym_envs.config import code_change, provenance
-from softgym_envs.storage import read_json
+from softgym_envs.config import code_changes, provenance
 from softgym_envs.wording import counted
 
 FEW_GOALS = 10
@@ -73,15 +72,8 @@ def collect(snapshot: StudySnapshot) -> StudyResults:
         importance=_importance(snapshot),
         cost=_cost(snapshot),
         success_distance=config.success_distance,
-        provenance={**provenance(), "code_changes": _code_changes(snapshot)},
+        provenance={**provenance(), "code_changes": code_changes(snapshot.folder.path)},
     )
-
-
-def _code_changes(snapshot: StudySnapshot) -> list[str]:
-    """Return which other code than began the study continued it."""
-    path = snapshot.folder.path / "provenance.json"
-    begun = read_json(path) if path.exists() else {}
-    return [code_change(begun, now) for now in begun.get("continued", [])]
 
 
 def _variables(config: StudyConfig, winner: Finalist | None) -> list[VariableResult]:
@@ -181,6 +173,7 @@ def _statistics(group: TestGroup, objective: Objective) -> BodyStatistics:
         mean_effort=mean.mean_effort,
         objective=group.value(objective.name),
         objective_interval=None if own is None else mean_interval(own),
+        largest_effort=none_for_nan(group.largest_effort),
     )
 
 

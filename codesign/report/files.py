@@ -82,6 +82,7 @@ def _test_row(group: TestGroup, body: Finalist, units: Mapping[str, str]) -> dic
         "worst_distance [m]": None if mean is None else group.worst_distance,
         "mean_return": _field(mean, "mean_return"),
         "mean_effort": _field(mean, "mean_effort"),
+        "largest_effort": None if mean is None else none_for_nan(group.largest_effort),
         "steps": _field(mean, "steps"),
         "unknowns": group.unknowns,
         "last_motion [m]": group.last_motion,

@@ -52,10 +52,12 @@ class TestSection:
 
     columns: list[str]
     rows: list[tables.ComparisonRow]
+    efforts: list[tables.EffortRow]
     missing: str
     measure: str
     reached: str | None
     goals_note: str
+    effort_note: str
     mesh_note: str
     interval_note: str
 
@@ -181,10 +183,12 @@ def _test_section(snapshot: StudySnapshot, results: StudyResults) -> TestSection
     return TestSection(
         columns=tables.comparison_columns(config),
         rows=[tables.comparison_row(row, config) for row in results.comparison],
+        efforts=tables.effort_rows(results.comparison, config.effort),
         missing=results.no_winner or sentences.why_untested(snapshot, results),
         measure=config.distance.label.lower(),
         reached=plots.reached(snapshot, results),
         goals_note=sentences.goals_note(snapshot),
+        effort_note=sentences.effort_note(snapshot),
         mesh_note=sentences.mesh_note(snapshot, results),
         interval_note=sentences.interval_note(snapshot, results),
     )

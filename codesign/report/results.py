@@ -60,6 +60,7 @@ class BodyStatistics(Record):
     mean_effort: float
     objective: float
     objective_interval: Interval
+    largest_effort: float | None = None  # unknown in tests of earlier versions
 
 
 @dataclass(frozen=True, eq=False)

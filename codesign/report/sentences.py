@@ -243,6 +243,14 @@ def _origin_of_goals(snapshot: StudySnapshot) -> str:
     return "drawn by the task for the baseline body, the same for every body"
 
 
+def effort_note(snapshot: StudySnapshot) -> str:
+    """Return over what the efforts of the test are means, and of what they are the largest."""
+    note = "Means are over actuators, steps and goals; the largest is that of any actuator in any step."
+    if snapshot.config.finalists.test == "ends":
+        note += " On FEM, they are those at the ends of the episodes."
+    return note
+
+
 def mesh_note(snapshot: StudySnapshot, results: StudyResults) -> str:
     """Return how the intervals contain the error of the mesh; empty without a finer mesh."""
     row = next((row for row in results.comparison if row.distance_mesh is not None), None)

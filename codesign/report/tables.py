@@ -61,6 +61,16 @@ class ComparisonRow:
 
 
 @dataclass(frozen=True)
+class EffortRow:
+    """Mean and largest effort of baseline and winner with one controller on one backend."""
+
+    backend: str
+    agent: str
+    mean: list[str]
+    largest: list[str]
+
+
+@dataclass(frozen=True)
 class TransferRow:
     """The difference of an objective between surrogate and FEM."""
 
@@ -183,6 +193,19 @@ def comparison_row(row: Comparison, config: StudyConfig) -> ComparisonRow:
         closer=row.goals_closer,
         farther=row.goals_farther,
     )
+
+
+def effort_rows(comparison: Sequence[Comparison], effort: Objective) -> list[EffortRow]:
+    """Return the efforts of baseline and winner for each controller and backend."""
+    return [
+        EffortRow(
+            backend=BACKENDS[row.backend],
+            agent=AGENTS[row.agent],
+            mean=[effort.text(body.mean_effort) for body in (row.baseline, row.winner)],
+            largest=[effort.text(body.largest_effort) for body in (row.baseline, row.winner)],
+        )
+        for row in comparison
+    ]
 
 
 def transfer_row(row: Transfer, objective: Objective) -> TransferRow:

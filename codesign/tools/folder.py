@@ -7,23 +7,35 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from softgym_envs.codesign.scheduling.storage import file_lock
-from softgym_envs.config import Config, check_compatible, load_stored, save_resolved
+from softgym_envs.config import (
+    Config,
+    check_compatible,
+    continue_with_code,
+    load_stored,
+    save_config,
+    save_resolved,
+)
 from softgym_envs.errors import ConfigError
 
-RESULTS = ("journal.log", "evaluations.jsonl", "result.json")
+CONTINUED = ("journal.log", "evaluations.jsonl")
+"""Results that a later run adds to."""
+RESULTS = (*CONTINUED, "result.json")
 
 
 @contextmanager
 def run_folder(
-    folder: str | Path, config: Config, kind: str, *, may_change: Sequence[str] = ("name",)
+    folder: str | Path, config: Config, kind: str, *, may_change: Sequence[str] = ("name",), progress: bool = False
 ) -> Iterator[Path]:
     """Reserve a folder for one run while the block runs, and write the resolved configuration there.
+
+    A run that continues another keeps the provenance of the first, and notes there if its code is another.
 
     Args:
         folder: a new one, or one with results of the same configuration.
         config: the configuration of the run.
         kind: what the run is, with its article, for messages: ``"a search"``, ...
         may_change: dotted keys of the configuration that may differ from those of earlier results.
+        progress: warn on standard error if other code began the run.
 
     Yields:
         The folder.
@@ -32,6 +44,7 @@ def run_folder(
         ConfigError: if the folder holds results of another configuration or of another tool, or if another process
             uses it.
     """
+    import click
     from filelock import Timeout
 
     folder = Path(folder)
@@ -43,7 +56,13 @@ def run_folder(
         raise ConfigError(f"folder '{folder}' is in use by another process; wait, or use another folder") from None
     try:
         _check(folder, config, kind, may_change)  # another process may have been faster
-        save_resolved(folder, config)
+        if any((folder / name).exists() for name in CONTINUED):
+            save_config(folder, config)
+            change = continue_with_code(folder)
+            if change and progress:
+                click.echo(f"warning: {kind} in '{folder}' was {change}; what they compute may differ", err=True)
+        else:
+            save_resolved(folder, config)
         yield folder
     finally:
         lock.release()

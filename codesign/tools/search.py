@@ -17,7 +17,7 @@ from softgym_envs.codesign.tools.evaluation import Evaluation, evaluate_each
 from softgym_envs.codesign.tools.folder import run_folder
 from softgym_envs.codesign.tools.plots import draw_front
 from softgym_envs.codesign.tools.records import FrontDesign, SearchResult
-from softgym_envs.config import provenance
+from softgym_envs.config import code_changes, provenance
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.storage import atomic_write, write_json
 from softgym_envs.wording import counted
@@ -42,11 +42,12 @@ def search(config: OptimiseConfig, folder: str | Path, *, progress: bool = True)
         ConfigError: if the folder holds results of another configuration or tool, or another process uses it.
         ConvergenceError: if no design is feasible.
     """
-    with run_folder(folder, config, "a search", may_change=("name", "workers", "solver.trials")) as place:
+    may_change = ("name", "workers", "solver.trials")
+    with run_folder(folder, config, "a search", may_change=may_change, progress=progress) as place:
         study = _Search(config, place)
         study.run(progress)
         result, values, front = study.result()
-        write_json(place / "result.json", {**provenance(), **result.to_json()})
+        write_json(place / "result.json", {**provenance(), "code_changes": code_changes(place), **result.to_json()})
         study.write_table(place / "trials.csv")
         draw_front(place / "front.png", [o.find() for o in config.objectives], values, front)
     return result

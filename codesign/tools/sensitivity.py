@@ -19,7 +19,7 @@ from softgym_envs.codesign.tools.folder import run_folder
 from softgym_envs.codesign.tools.metrics import find_metric
 from softgym_envs.codesign.tools.plots import draw_sensitivity
 from softgym_envs.codesign.tools.records import SensitivityResult
-from softgym_envs.config import provenance
+from softgym_envs.config import code_changes, provenance
 from softgym_envs.errors import ConfigError, ConvergenceError, DataError
 from softgym_envs.storage import JsonLines, write_json
 
@@ -178,9 +178,10 @@ def analyse_sensitivity(config: SensitivityConfig, folder: str | Path, *, progre
         DataError: if a line of ``evaluations.jsonl`` is damaged.
         ConvergenceError: if too few designs are feasible.
     """
-    with run_folder(folder, config, "a sensitivity study", may_change=("name", "workers")) as place:
+    may_change = ("name", "workers")
+    with run_folder(folder, config, "a sensitivity study", may_change=may_change, progress=progress) as place:
         result = _analyse(config, place, progress)
-        write_json(place / "result.json", {**provenance(), **result.to_json()})
+        write_json(place / "result.json", {**provenance(), "code_changes": code_changes(place), **result.to_json()})
         metrics = [find_metric(name) for name in config.metrics]
         draw_sensitivity(place / "sensitivity.png", config.method, metrics, result.indices)
     return result

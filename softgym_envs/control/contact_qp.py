@@ -219,8 +219,8 @@ class ContactQP(InverseQP):
         own = np.abs(np.diag(W)[:n])
         stiffness = 1.0 / np.where(own > 0.0, own, own.max())
         limited = np.isfinite(self.effort_rates)
-        by_effort = np.where(limited, self.effort_rates, 0.0) / stiffness[:a]
-        length = np.where(limited, np.minimum(self.rates, by_effort), self.rates)
+        effort_lengths = np.where(limited, self.effort_rates, 0.0) / stiffness[:a]
+        length = np.where(limited, np.minimum(self.rates, effort_lengths), self.rates)
         reach = float((np.abs(W[a:n, :a]) @ (length * stiffness[:a])).max(initial=0.0))
         reach = reach or float(np.abs(delta[a:n]).max(initial=0.0)) or float(length.max())
         length = np.append(length, np.full(n - a, reach))

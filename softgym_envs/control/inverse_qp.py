@@ -390,8 +390,8 @@ class InverseQP:
 
         limited = np.isfinite(self.effort_rates)
         diagonal = np.diagonal(Waa, axis1=-2, axis2=-1)
-        by_effort = np.abs(diagonal) * np.where(limited, self.effort_rates, 0.0)
-        scale = np.where(limited, np.minimum(self.rates, by_effort), self.rates)
+        effort_lengths = np.abs(diagonal) * np.where(limited, self.effort_rates, 0.0)
+        scale = np.where(limited, np.minimum(self.rates, effort_lengths), self.rates)
         unit = scale.max(axis=-1, keepdims=True) / scale
         reach = Wea * unit[..., None, :]
         epsilon = np.linalg.norm(_transposed(reach) @ reach, axis=(-2, -1))

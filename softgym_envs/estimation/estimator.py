@@ -359,6 +359,8 @@ class Estimator:
         if self.noise.effort is not None:
             parts.append(checked_readings("efforts", readings.efforts, n_a))
             noise.append(np.full(n_a, self.noise.effort))
+        elif readings.efforts is not None:
+            raise ValueError("readings have efforts, whose noise is unknown; use Noise(effort=...) or leave them out")
         last, before = np.concatenate(parts), self._evidence
         if before is None or self._drift.any() or (command != before.command).any():
             prior = replace(self.belief, covariance=self.belief.covariance + np.diag(self._drift**2))
@@ -382,7 +384,8 @@ class Estimator:
         After an error the estimator knows what it knew before.
 
         Raises:
-            ValueError: if readings have a wrong shape, are not finite (a lost sensor) or are impossible (a wrong unit).
+            ValueError: if readings have a wrong shape, are not finite (a lost sensor) or are impossible (a wrong unit),
+                or have efforts although the noise does not.
             ConvergenceError: if the body has no equilibrium under the command, at the most probable load before it.
         """
         n_a, self._solved = self._counts[0], 0

@@ -235,9 +235,12 @@ class LearnedEstimator:
         After an error the estimator knows what it knew before.
 
         Raises:
-            ValueError: if readings have a wrong shape, are not finite (a lost sensor) or are impossible (a wrong unit).
+            ValueError: if readings have a wrong shape, are not finite (a lost sensor) or are impossible (a wrong unit),
+                or have efforts.
             ConvergenceError: if the model finds no equilibrium.
         """
+        if readings.efforts is not None:
+            raise ValueError("the estimator on a learned model does not read efforts; leave them out, or use Estimator")
         command = checked_command(self.robot, readings.command)
         volumes = checked_volumes(readings.volumes, self.rest_volumes) - self.rest_volumes
         known = self._known

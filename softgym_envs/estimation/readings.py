@@ -26,7 +26,8 @@ class Noise:
         displacement: of the true displacement of an actuator around its command [m].
         volume: of the measured volume of a cavity [m3].
         pressure: of the measured pressure of the air in a sealed cavity [Pa].
-        effort: of the measured effort of an actuator [N]; None if it is not measured.
+        effort: of the measured effort of an actuator [N]; None if it is not measured. Readings with efforts are then
+            refused.
         drift: of each parameter of the load from one reading to the next, as a part of its spread before any reading.
 
     Raises:

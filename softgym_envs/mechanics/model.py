@@ -35,6 +35,7 @@ from softgym_envs.mechanics.solids import (
     PerElement,
     are_rows,
     check_distance,
+    check_modulus,
     check_size,
     described,
     fixed_mask,
@@ -154,7 +155,7 @@ class MechanicalModel:
             element: ``"linear"``, ``"averaged"`` (no locking near a Poisson's ratio of 0.5) or ``"quadratic"``.
             material: a `Material` or its name.
             young_modulus: [Pa]; one number, an array (m,), a mapping of region names to numbers, or a function of the
-                elements' centroids [m] (m, 3).
+                elements' centroids [m] (m, 3). Less than 100 Pa is rejected as a unit mistake.
             poisson_ratio: inside (-1, 0.5), in the same forms.
             density: [kg/m3].
             total_mass: mass of the body [kg], instead of the density.
@@ -176,6 +177,7 @@ class MechanicalModel:
             regions=regions,
             max_size=max_size,
         )
+        check_modulus(part.options["young_modulus"])
         block = part.kind(part.nodes, part.connectivity, **part.options)
         return cls(part.nodes, [block], fixed=part.fixed, gravity=gravity, solver=solver)
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from softgym_envs.errors import unknown_name
 from softgym_envs.mechanics.elements.averaged import AveragedTetrahedra
@@ -22,6 +23,10 @@ SOLIDS: dict[str, type[SolidBlock]] = {
 
 MAX_BODY_SIZE = 10.0
 """Largest side [m] of a body; a longer one is rejected as a unit mistake."""
+
+MIN_YOUNG_MODULUS = 100.0
+"""Smallest Young's modulus [Pa] of a robot or of a mesh of one material, that of the softest gels; a smaller one is
+rejected as a unit mistake. `ModelBuilder` takes any, for models in units without dimensions."""
 
 PerElement = float | np.ndarray | Mapping[str, float] | Callable[[np.ndarray], np.ndarray]
 """A value for all elements, one for each (m,), one for each region by name, or a function of the centroids (m, 3)."""
@@ -131,6 +136,21 @@ def check_size(nodes: np.ndarray, max_size: float, hint: str) -> None:
     if sides.max() > max_size:
         spans = " x ".join(f"{side:.3g}" for side in sides)
         raise ValueError(f"the body measures {spans} m, more than {max_size:g} m; did you mean metres? ({hint})")
+
+
+def check_modulus(young_modulus: ArrayLike) -> None:
+    """Reject Young's moduli [Pa] that are softer than any gel; those that are not positive are left to the elements.
+
+    Raises:
+        ValueError: with a hint on how to correct the unit.
+    """
+    values = np.ravel(young_modulus)
+    soft = values[(values > 0.0) & (values < MIN_YOUNG_MODULUS)]
+    if soft.size:
+        raise ValueError(
+            f"young_modulus = {soft.min():g} Pa is less than {MIN_YOUNG_MODULUS:g} Pa, that of the softest gels; did "
+            "you mean pascals? (for a value in MPa pass 1e6 times it)"
+        )
 
 
 def check_distance(points: np.ndarray, nodes: np.ndarray, name: str, sizes: float) -> None:

@@ -19,6 +19,7 @@ from softgym_envs.mechanics.contact.contact import ContactSettings
 from softgym_envs.mechanics.contact.obstacles import Obstacle, obstacle_from
 from softgym_envs.mechanics.materials import resolve_material
 from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.mechanics.solids import check_modulus
 from softgym_envs.robots.actuator import Actuator as Actuator
 from softgym_envs.robots.geometry.meshing import BodyMesh
 from softgym_envs.robots.geometry.morphing import Feature, Morpher
@@ -274,6 +275,7 @@ class Robot(ABC):
         try:
             model = self.assemble(complete)
             self._check_rows(model)
+            check_modulus([block.largest_young_modulus for block in model.blocks])
             self._add_contact(model, complete)
             return model
         except SoftGymError:
@@ -290,10 +292,8 @@ class Robot(ABC):
         for role, kind in (("a", "actuators"), ("e", "effectors")):
             added = tuple(constraint.name for constraint in model.constraints[role])
             if added != declared[role]:
-                raise ValueError(
-                    f"robot '{self.name}': assemble must add the {kind} {', '.join(declared[role])} in this order, "
-                    f"got {', '.join(added) or 'none'}"
-                )
+                wanted, got = (", ".join(names) or "none" for names in (declared[role], added))
+                raise ValueError(f"robot '{self.name}': assemble must add the {kind} {wanted} in this order, got {got}")
 
     def printable(self) -> Robot:
         """Return the robot whose solid parts are this one's body; it takes the same designs."""

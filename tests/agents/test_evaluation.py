@@ -50,10 +50,32 @@ def test_files_hold_everything(evaluation):
     assert again.successes.dtype == evaluation.successes.dtype
 
 
-def test_files_from_before_trust_was_recorded_can_be_read():
+def test_files_from_before_trust_and_largest_efforts_were_recorded_can_be_read():
     data = some(3, 0).to_json()
-    assert data.pop("untrusted") == [None, None, None]
-    assert np.isnan(Evaluation.from_json(data).untrusted).all()
+    for name in ("untrusted", "largest_efforts"):
+        assert data.pop(name) == [None, None, None]
+        assert np.isnan(getattr(Evaluation.from_json(data), name)).all()
+    distances = data["mean_distances"] = data.pop("tracking_distances")  # its earlier name
+    np.testing.assert_array_equal(Evaluation.from_json(data).tracking_distances, distances)
+
+
+@pytest.mark.parametrize("backend", ["surrogate", "fem"])  # together and one by one
+def test_largest_efforts_are_those_of_any_actuator_in_any_step(backend):
+    environment = EnvironmentConfig(id="SoftGym/FingerReach-v0", backend=backend, max_episode_steps=4)
+    goals = sample_goals(environment, 2, seed=0)
+    found = evaluate("qp", environment, goals)
+    env = environment.make()
+    act, largest, means = make_agent("qp"), [], []
+    for goal in goals:
+        observation, _ = env.reset(seed=0, options={"goal": goal})
+        efforts = []
+        for _ in range(4):
+            observation, _, _, _, info = env.step(act(observation, env.unwrapped))
+            efforts.append(np.abs(info["effort"]))
+        largest.append(np.max(efforts))
+        means.append(np.mean(efforts))
+    np.testing.assert_allclose(found.largest_efforts, largest, rtol=1e-3)
+    np.testing.assert_allclose(found.efforts, means, rtol=1e-3)
 
 
 def test_untrusted_states_are_counted():
@@ -110,7 +132,7 @@ def test_processes_share_goals_and_give_the_same_numbers(agent):
     environment = EnvironmentConfig(id="SoftGym/FingerReach-v0", backend="fem")
     goals = sample_goals(environment, 3, seed=5)
     one, two = (evaluate(agent, environment, goals, seed=1, workers=workers) for workers in (1, 2))
-    for name in ("distances", "mean_distances", "returns", "successes", "efforts", "ends"):
+    for name in ("distances", "tracking_distances", "returns", "successes", "efforts", "ends"):
         np.testing.assert_array_equal(getattr(two, name), getattr(one, name))
     assert two.steps == one.steps == 150 and two.cpu_seconds > 0.0
     assert len(set(one.returns)) == 3  # episodes differ

@@ -114,7 +114,7 @@ def test_pi_corrects_a_model_that_differs_from_the_plant():
 def test_pi_does_not_count_the_motion_of_the_goal_as_an_error():
     own = on("GripperPinch")
     path = sample_goals(own, 1, seed=0)
-    corrected, plain = (evaluate(name, own, path).mean_distances[0] for name in ("qp_pi", "qp_model"))
+    corrected, plain = (evaluate(name, own, path).tracking_distances[0] for name in ("qp_pi", "qp_model"))
     # What a step leaves of the way to a moving goal (0.13 mm on average) is corrected as well: measured 1.6 times. With
     # the motion of the goal counted as an error it was 7 times.
     assert corrected < 2.0 * plain

@@ -76,7 +76,7 @@ def test_a_policy_ends_where_its_whole_episode_on_finite_elements_does(diamond, 
     assert (found.successes == whole.successes).all()
     assert 0.0 < followed.last_motion < 5e-5
     assert found.steps == len(goals) * 5
-    assert np.isnan(found.returns).all() and np.isnan(found.mean_distances).all()
+    assert np.isnan(found.returns).all() and np.isnan(found.tracking_distances).all()
     assert followed.unknowns == diamond.make_robot().build(design).equations
 
 

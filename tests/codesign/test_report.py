@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from PIL import Image, ImageSequence
@@ -12,6 +14,7 @@ from softgym_envs.codesign.report.collect import collect
 from softgym_envs.codesign.report.episodes import typical_goal
 from softgym_envs.codesign.report.findings import findings
 from softgym_envs.codesign.report.interactive import goal_outcomes, goal_views, history, slices
+from softgym_envs.codesign.report.tables import effort_rows
 from softgym_envs.codesign.report.units import time_text
 from softgym_envs.codesign.snapshot import load_study
 from softgym_envs.viewer.video import write_video
@@ -23,7 +26,8 @@ def evaluation(distances):
     distances = np.asarray(distances, dtype=float)
     ones = np.ones(len(distances))
     ends = distances[:, None] * [0.0, 0.6, -0.8]  # any point
-    return Evaluation(distances, distances, ones, distances < 2e-3, ones, ends, steps=1)
+    largest = 3.0 + ones.cumsum()
+    return Evaluation(distances, distances, ones, distances < 2e-3, ones, ends, steps=1, largest_efforts=largest)
 
 
 def write_trial(folder, number, score, place, controller="qp"):
@@ -145,6 +149,16 @@ def test_plots_show_every_complete_trial(tested):
     shown = [trace for trace in history(snapshot, results).data if trace.mode == "markers"]
     assert {trace.name: list(trace.y) for trace in shown} == {"baseline": [5.0], "winner": [1.0]}
     assert len([trace for trace in slices(snapshot, results).data if trace.name == "winner"]) == 2
+
+
+def test_efforts_stand_in_the_report(tested):
+    snapshot = tested(FAR, NEAR)
+    results = collect(snapshot)
+    (row, _) = effort_rows(results.comparison, snapshot.config.effort)
+    assert (row.backend, row.agent, row.mean, row.largest) == ("FEM", "Policy", ["1.00 N"] * 2, ["9.00 N"] * 2)
+    body = replace(results.comparison[0].winner, largest_effort=None)  # of an earlier version
+    (row,) = effort_rows([replace(results.comparison[0], winner=body)], snapshot.config.effort)
+    assert row.largest == ["9.00 N", "-"]
 
 
 def test_finalists_differ(study):

@@ -159,6 +159,8 @@ def test_report(finished):
     for role in ("baseline", "winner"):
         assert f"{1e3 * getattr(row, role).mean_distance:.2f} mm" in text
         assert f"{100 * getattr(row, role).success_rate:.1f} %" in text
+        for effort in (getattr(row, role).mean_effort, getattr(row, role).largest_effort):
+            assert f"{effort:.2f} N" in text
     for variable in finished.results.variables[1:3]:
         assert f"{1e3 * variable.winner:.2f} mm" in text
         assert (f"at its {variable.at_limit} limit" in text) == bool(variable.at_limit)

@@ -20,7 +20,7 @@ def evaluation(distances, steps=50, **changes):
     """An evaluation with these final distances [m]."""
     distances = np.array(distances, dtype=float)
     ones = np.ones(len(distances))
-    fields = {"mean_distances": distances, "returns": ones, "successes": distances < 2e-3, "efforts": ones}
+    fields = {"tracking_distances": distances, "returns": ones, "successes": distances < 2e-3, "efforts": ones}
     fields["ends"] = np.zeros((len(distances), 3))
     return Evaluation(distances=distances, steps=steps, **{**fields, **changes})
 

@@ -279,6 +279,8 @@ def test_wrong_inputs_name_themselves():
         estimator.update(estimator.reading(np.array([6.0]), rest))  # millimetres
     with pytest.raises(ValueError, match=r"readings 'change' must be 2 finite values, got \[0.0, 0.0, 0.0\]"):
         estimator.reading(np.array([0.006]), np.zeros(3))
+    with pytest.raises(ValueError, match=r"readings have efforts, whose noise is unknown; use Noise\(effort="):
+        estimator.update(estimator.reading(np.array([0.006]), rest, efforts=np.ones(1)))
     with pytest.raises(ValueError, match="equilibria = 0 must be positive"):
         Estimator(robot, equilibria=0)
     with pytest.raises(ValueError, match="radius = -1.0 must be positive"):

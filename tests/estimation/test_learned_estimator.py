@@ -218,6 +218,8 @@ def test_wrong_inputs_are_named(robot):
         LearnedEstimator(robot, noise=Noise(drift=0.1))
     with pytest.raises(ValueError, match="volumes"):
         touched(robot).update(Readings(COMMAND, np.array([1.0])))
+    with pytest.raises(ValueError, match="does not read efforts; leave them out, or use Estimator"):
+        touched(robot).update(Readings(COMMAND, np.ones(2), efforts=np.ones(2)))
     with pytest.raises(ValueError, match="errors must have 5 rows"):
         LearnedEstimator(robot, errors=RowErrors.none(4))
 

@@ -258,6 +258,42 @@ def test_an_interrupted_sensitivity_study_continues(tmp_path):
         analyse_sensitivity(study("oat"), tmp_path, progress=False)
 
 
+def begun_by_other_code(folder):
+    """Let the provenance of a folder say that other code began its results; return this provenance."""
+    record = json.loads((folder / "provenance.json").read_text()) | {"sources": "other", "commit": None}
+    (folder / "provenance.json").write_text(json.dumps(record))
+    return record
+
+
+def test_a_continued_run_keeps_its_first_provenance(stub, tmp_path, capsys):
+    def run_search(trials):
+        solver = {"method": "search", "sampler": SAMPLER, "trials": trials, "batch": 6}
+        search(configured(solver=solver), tmp_path / "search")
+
+    def run_sensitivity(workers):
+        analyse_sensitivity(study("oat", workers=workers), tmp_path / "sensitivity")
+
+    for run, name, kind in (
+        (run_search, "search", "a search"),
+        (run_sensitivity, "sensitivity", "a sensitivity study"),
+    ):
+        folder = tmp_path / name
+        run(1)
+        begun = json.loads((folder / "provenance.json").read_text())
+        run(1)  # by the same code
+        assert json.loads((folder / "provenance.json").read_text()) == begun
+        assert json.loads((folder / "result.json").read_text())["code_changes"] == []
+        begun = begun_by_other_code(folder)
+        capsys.readouterr()
+        run(2)
+        kept = json.loads((folder / "provenance.json").read_text())
+        (continued,) = kept.pop("continued")
+        change = f"begun with sources other; continued with sources {continued['sources']}"
+        assert kept == begun
+        assert f"warning: {kind} in '{folder}' was {change}; what they compute may differ" in capsys.readouterr().err
+        assert json.loads((folder / "result.json").read_text())["code_changes"] == [change]
+
+
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)
 def test_shipped_configurations_load(path):
     text = path.read_text()
