@@ -536,6 +536,19 @@ def surrogate_speed() -> str:
     return markdown(["environment", "one at a time", "1024 at once, one process", "two processes"], rows, "lrrr")
 
 
+def gpu_speed() -> str:
+    """Steps per second of the environments in torch, bodies given or drawn, by how a step is run."""
+    found = results("gpu_step")
+    labels = [key.removesuffix(": steps per second").split(", ") for key in found if ", " in key]
+    modes = list(dict.fromkeys(mode for _, _, mode in labels))
+    rows = []
+    for name, bodies in dict.fromkeys((name, bodies) for name, bodies, _ in labels):
+        speeds = [found.get(f"{name}, {bodies}, {mode}: steps per second") for mode in modes]
+        cells = ["" if speed is None else f"{speed / 1e6:.1f}" for speed in speeds]
+        rows.append([name.removesuffix("-v0"), bodies.removesuffix(" design"), *cells])
+    return markdown(["environment", "design", *(f"{mode} [10⁶ steps/s]" for mode in modes)], rows, "llrrr")
+
+
 def fem_speed() -> str:
     """Steps per second of the environments on FEM."""
     found = results("fem_speed")
@@ -581,7 +594,7 @@ TABLES: dict[str, Callable[[], str]] = {
         design_optima,
         tracking, closed_loop, design_networks, sensor_accuracy, sensor_convergence, sealed_stiffness,
         estimates, sealed_estimates, side_by_side, stiff_flop,
-        validation, contact, surrogate_speed, fem_speed, deployed, provenance,
+        validation, contact, surrogate_speed, gpu_speed, fem_speed, deployed, provenance,
     )
 }  # fmt: skip
 """Tables by the name in a marked place."""
