@@ -23,7 +23,6 @@ COMMIT = "[0-9a-f]{7,40}"
 ROOT = Path(__file__).parent.parent
 
 REWRITTEN = {
-    "benchmarks/data/recorded.json sensor_trials",
     "benchmarks/data/recorded.json zigzag_robust",
     "codesign/benchmark/data/references/cable-trunk-reach-v2.json found",
     "softgym_envs/surrogate/chain/weights/contact_aided_finger/model.json provenance",
