@@ -20,8 +20,7 @@ def bench(output: Path, names: tuple[str, ...]) -> None:
 
     Runs the benchmarks NAMES, or all of them if no name is given, which takes hours. Needs a source checkout.
 
-    convergence_two_finger_gripper_taut, also part of "convergence", takes more than 25 CPU minutes: after them its
-    finer mesh was not solved, so the documentation has no row of it.
+    Those of the convergence of grippers, also part of "convergence", take up to an hour and 8 GB each.
     """
     try:
         from benchmarks.run import run
