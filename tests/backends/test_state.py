@@ -82,7 +82,7 @@ def test_copies_of_states_in_contact_hold_the_condensed_model(pressed, duplicate
     assert all(isinstance(vars(state)["condensed"], CondensedModel) for state in copied)
     for state, own in zip(copied, states, strict=True):
         np.testing.assert_array_equal(state.condensed.compliance, own.condensed.compliance)
-        assert state.contacts.total == own.contacts.total
+        np.testing.assert_array_equal(state.contacts.total, own.contacts.total)
 
 
 def test_reading_the_compliance_does_not_disturb_the_next_step(pressed):
