@@ -70,7 +70,8 @@ def test_a_robot_that_cannot_be_drawn_with_fillets_says_so():
 
 
 def test_the_guide_radius_is_an_option_and_part_of_the_key():
-    for name, radius in (("finger", 1e-3), ("press_finger", 3e-3), ("two_finger_gripper", 3e-3)):
+    radii = {"finger": 3e-3, "press_finger": 3e-3, "two_finger_gripper": 3e-3, "sensorized_finger": 1e-3}
+    for name, radius in radii.items():
         by_mesh = [make_robot(name, mesh=mesh) for mesh in NAMES]
         assert [robot.guide_radius for robot in by_mesh] == [0.0, radius, radius]
         assert [robot.mechanics_key.get("guide_radius") for robot in by_mesh] == [None, radius, radius]
