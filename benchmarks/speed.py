@@ -26,15 +26,13 @@ def median_seconds(work: Callable[[], object], repeats: int) -> float:
     return statistics.median(times)
 
 
-def _random_walk(env, steps: int, seed: int, *, with_compliance: bool = False) -> Callable[[], None]:
+def _random_walk(env, steps: int, seed: int) -> Callable[[], None]:
     env.action_space.seed(seed)
     actions = [env.action_space.sample() for _ in range(steps)]
 
     def walk() -> None:
         for action in actions:
             _, _, terminated, truncated, _ = env.step(action)
-            if with_compliance:
-                env.unwrapped.state.condensed  # noqa: B018 - computes it
             if terminated or truncated:
                 env.reset()
 
@@ -42,10 +40,7 @@ def _random_walk(env, steps: int, seed: int, *, with_compliance: bool = False) -
 
 
 def fem_step() -> dict[str, object]:
-    """FEM environment steps per second, random cable increments up to 1 mm about a half-pulled finger.
-
-    With ``W`` read after each step, and without.
-    """
+    """FEM environment steps per second, random cable increments up to 1 mm about a half-pulled finger, W included."""
     import gymnasium
 
     import softgym_envs  # noqa: F401 - registers the IDs
@@ -54,19 +49,17 @@ def fem_step() -> dict[str, object]:
     for cables in (1, 2):
         env = gymnasium.make("SoftGym/FingerReach-v0", backend="fem", robot_options={"cables": cables})
         env.reset(seed=0)
+        repeats = []
+        for repeat in range(5):
+            env.reset(seed=repeat)
+            for _ in range(12):
+                env.step(np.ones(cables, dtype=np.float32))
+            repeats.append(median_seconds(_random_walk(env, 30, repeat), 1) / 30)
+        seconds = statistics.median(repeats)
         unwrapped: Any = env.unwrapped
         model = unwrapped.backend.model
         label = f"{cables} cable(s), {len(model.nodes)} nodes, {len(model.blocks[0].connectivity)} tetrahedra"
-        for with_compliance in (True, False):
-            repeats = []
-            for repeat in range(5):
-                env.reset(seed=repeat)
-                for _ in range(12):
-                    env.step(np.ones(cables, dtype=np.float32))
-                walk = _random_walk(env, 30, repeat, with_compliance=with_compliance)
-                repeats.append(median_seconds(walk, 1) / 30)
-            without = "" if with_compliance else ", without W"
-            result[f"{label}{without}: steps per second"] = 1.0 / statistics.median(repeats)
+        result[f"{label}: steps per second"] = 1.0 / seconds
     return result
 
 
@@ -197,7 +190,7 @@ def _environment_speed(identifier: str, options: dict[str, object], steps: int, 
 
 
 def fem_speed() -> dict[str, object]:
-    """Every environment on FEM under random actions: on its own mesh and on a finer one. No step reads ``W``.
+    """Every environment on FEM under random actions, W included: on its own mesh and on a finer one.
 
     The finer mesh has elements of a tenth of the volume, or ten times as many where a robot option sets their number.
     """

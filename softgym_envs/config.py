@@ -300,7 +300,7 @@ def _source_hash() -> str:
         files |= {(place / name).as_posix(): Path(folder, name) for name in names}
     digest = hashlib.sha256()
     for name in sorted(files):
-        if name.endswith((".py", ".json", ".npz", ".safetensors")):
+        if name.endswith((".py", ".json", ".npz", ".safetensors")) and files[name].is_file():  # no broken links
             digest.update(f"{name}\0".encode() + hashlib.sha256(files[name].read_bytes()).digest())
     return digest.hexdigest()[:12]
 

@@ -44,12 +44,13 @@ class State:
         effort: actuator efforts [N, ...], shape (n_a,).
         effector: effector positions [m], shape (k, 3).
         slack: which actuators are slack, shape (n_a,).
-        condensed: condensed model at the state; learned models and static FEM evaluate it when it is first read.
+        condensed: condensed model at the state; learned models, and FEM in contact, evaluate it when it is first read.
         row_effort: efforts of all rows of the body's model, bonds last, shape (size,); empty on the surrogate.
         velocity: effector velocities [m/s], shape (k, 3); zero without dynamics.
         motion: time, velocities and energies of the body; None without dynamics, and on the surrogate.
         stable: the equilibrium is stable whether displacements or efforts are commanded (always True on the
-            surrogate). In dynamics: the tangent of the time step, including inertia, is positive definite.
+            surrogate); on FEM in contact it may be that of the last iterate. In dynamics: the tangent of the time step,
+            including inertia, is positive definite.
         uncertainty: bound on 95 % of the effector errors of a learned model [m]; 0 for FEM without
             learned superelements.
         doubt: why the model is not trusted at the state, 0 if it is: a sum of numbers in

@@ -37,7 +37,7 @@ def _relax_dynamically(model: MechanicalModel, statics: Statics, command: np.nda
 
 
 class FEMBackend(Backend):
-    """States from finite elements: static equilibria with exact ``W``, computed when it is read, or motion in time.
+    """States from finite elements: static equilibria with exact ``W``, or motion in time.
 
     An actuator whose effort would exceed its ``max_effort`` is driven by that effort instead, until its command asks
     for less.
@@ -116,7 +116,6 @@ class FEMBackend(Backend):
             if self.robot.rest_mode == "effort" and model.loads.any():
                 # Loads would move the actuators, so they are held.
                 rest = statics.solve(zero)
-            rest = exact_at(statics, rest)
             self._dynamics = Dynamics(model, **self.step_options) if self.moving else None
             self.model, self._statics, self.design = model, statics, complete
             self._rest = self._state(rest, zero, still=True)
@@ -159,8 +158,8 @@ class FEMBackend(Backend):
         """Return the static solver of a body."""
         statics = Statics(model)
         linear, learned = statics.linearisation, any(block.learned for block in model.blocks)
-        # Only W needs the last factorisation of a step: it is made when W is read. Sensors are read with it.
-        statics.exact_compliance = linear.rubs or learned or "s" in dict(model.roles)
+        # In contact, only W needs the last factorisation of a step: it is made when W is read.
+        statics.exact_compliance = linear.contact is None or linear.rubs or learned
         return statics
 
     def _checked_friction(self, friction: float) -> float:

@@ -25,8 +25,8 @@ MAX_BODY_SIZE = 10.0
 """Largest side [m] of a body; a longer one is rejected as a unit mistake."""
 
 MIN_YOUNG_MODULUS = 100.0
-"""Smallest Young's modulus [Pa] of a robot or of a mesh of one material, that of the softest gels; a smaller one is
-rejected as a unit mistake. `ModelBuilder` takes any, for models in units without dimensions."""
+"""Smallest Young's modulus [Pa] of the parts of a robot, and of a mesh of one material: that of the softest gels. A
+smaller one is rejected as a unit mistake. `ModelBuilder` takes any, for models in units without dimensions."""
 
 PerElement = float | np.ndarray | Mapping[str, float] | Callable[[np.ndarray], np.ndarray]
 """A value for all elements, one for each (m,), one for each region by name, or a function of the centroids (m, 3)."""

@@ -205,10 +205,17 @@ def test_an_interrupted_run_continues_with_the_next_body(tmp_path, monkeypatch):
     assert (solve_commands(robot, other, folder=tmp_path).command == other.command[0]).all() and solved == [0]
 
 
-def test_several_processes_solve_the_same_states(tmp_path):
-    robot = make_robot("trunk")
+def test_several_processes_solve_the_same_states(tmp_path, monkeypatch):
+    robot, asked, parallel_map = make_robot("trunk"), [], strata.parallel_map
+
+    def counted(function, arguments, workers):
+        asked.append(workers)
+        return parallel_map(function, arguments, workers)
+
+    monkeypatch.setattr(strata, "parallel_map", counted)
     commands = draw_commands(robot, "inside", 3, 2)
     alone, together = (solve_commands(robot, commands, folder=tmp_path / str(n), workers=n) for n in (1, 2))
+    assert asked == [1, 2]
     for name, values in vars(alone).items():
         other = vars(together)[name]
         if values.dtype.kind == "f":  # their last digits depend on where arrays lie in memory

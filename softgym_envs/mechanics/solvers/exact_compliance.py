@@ -19,24 +19,31 @@ def exact_at(statics: Statics, found: Equilibrium) -> Equilibrium:
 
     Raises:
         ConvergenceError: if the tangent is singular.
-        ValueError: if the body has friction, whose tangent depends on what happened before the equilibrium, or if its
-            elasticity has changed since.
+        ValueError: if there is friction, whose tangent depends on what happened before the equilibrium, or if the body
+            has changed since.
     """
     if found.conditions is None:
         return found
-    linear, (loads, elasticity_version) = statics.linearisation, found.conditions
-    if elasticity_version != statics.model.elasticity_version:
-        raise ValueError("the elasticity of the body has changed since this equilibrium was found; solve for it again")
-    pairs = (found.x, statics.x), (found.effort, statics.effort), (loads, linear.loads)
-    if not all(np.array_equal(*pair) for pair in pairs):
-        linear = Linearisation(statics.model)
-        linear.loads = loads
+    model, linear, (loads, elasticity_version) = statics.model, statics.linearisation, found.conditions
     if linear.rubs:
         raise ValueError("a body with friction needs a solver with exact_compliance=True")
+    contact = None if linear.contact is None else linear.contact.contact
+    same = model.assembly is linear.assembly and model.contact is contact
+    if not same or elasticity_version != model.elasticity_version:
+        raise ValueError(
+            "the constraints, contact or elasticity of the body have changed since this equilibrium was found; "
+            "solve for it again"
+        )
+    pairs = (found.x, statics.x), (found.effort, statics.effort), (loads, linear.loads)
+    if all(np.array_equal(*pair) for pair in pairs):
+        linear.current = False  # until the update has succeeded
+    else:
+        linear = Linearisation(model)
+        linear.loads, linear.cable_friction = loads, None  # the body may have been given friction since
     if not linear.update(found.x, found.effort, exact=True):
         raise ConvergenceError("the tangent of the equilibrium is singular", fraction=1.0)
     values = found.x, found.effort, linear.delta, linear.W, found.slack
-    layout = RowLayout.of(statics.model)
+    layout = RowLayout.of(model)
     stable = linear.positive_definite
     condensed = layout.equilibrium(*values, stable=stable, iterations=0).condensed
     return replace(found, condensed=condensed, stable=stable, conditions=None)

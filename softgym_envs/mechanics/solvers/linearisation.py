@@ -11,9 +11,6 @@ from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.cable_friction import CableFriction, CableMemory, FrictionTerms
 from softgym_envs.mechanics.solvers.tangent import Tangent
 
-MAX_RESPONSE = 4.0
-"""Largest response to a random load, relative to the first tangent, of tangents that count as far from singular."""
-
 
 class Linearisation:
     """Assembles the equations of a model and keeps the factorised tangent with the compliance of its constraints.
@@ -30,7 +27,6 @@ class Linearisation:
         contact: the contacts of the body, or None.
         cable_friction: the frictional cables of the body, or None.
         current: whether this is the linearisation at the solver's current state; the solver resets it.
-        first_response: to a random load, of the first tangent; the solver resets it for another elasticity.
         located: whether the factorised tangent is that of the equations, and not of a state nearby.
         exact: whether the factorised tangent is exact. Away from an equilibrium, terms of contact that make it
             indefinite are left out.
@@ -60,9 +56,6 @@ class Linearisation:
         self.located = True
         self.exact = True
         self._model = model
-        self.first_response: float | None = None
-        scale = model.kinematics.dof_scale
-        self._random_load = scale * np.random.default_rng(0).normal(size=len(scale))
         self._friction_terms: FrictionTerms | None = None
         self._terms: ContactTerms | None = None
         self._tangent = Tangent(self.assembly.indptr, self.assembly.indices, model.solver)
@@ -96,21 +89,6 @@ class Linearisation:
     def positive_definite(self) -> bool:
         """Whether the factorised tangent is exact and positive definite."""
         return self.exact and self._tangent.solver.positive_definite
-
-    def is_far_from_singular(self) -> bool:
-        """Whether the factorised tangent is positive definite, and will be after the last small corrections.
-
-        The response to a random load grows without bound as any eigenvalue nears zero. It is compared with that of the
-        first tangent. Next to the points where grippers buckle, after steps of up to half of the pull, tangents that
-        the last corrections made indefinite had at least 17 times that response.
-        """
-        if not self.positive_definite or self.first_response is None:
-            return False
-        return self._response_to_load() <= MAX_RESPONSE * self.first_response
-
-    def _response_to_load(self) -> float:
-        """Return the size of the displacements under the random load."""
-        return float(np.linalg.norm(self._model.kinematics.dof_scale * self.solve(self._random_load)))
 
     def buckling(self, rows: np.ndarray) -> int:
         """Return how many negative eigenvalues ``W`` has in rows that carry efforts; 0 where contact may hold the body.
@@ -209,8 +187,6 @@ class Linearisation:
         self.W = W if self._slips else 0.5 * (W + W.T)
         self.shift = response[:count, count]
         self.current = self.located = True
-        if self.first_response is None and self.contact is None and self.positive_definite:
-            self.first_response = self._response_to_load()
         return True
 
     def follow(self, assembled: Assembled) -> None:

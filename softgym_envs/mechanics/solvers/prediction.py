@@ -45,7 +45,7 @@ class Steps:
 
     Attributes:
         corrections: sum of all steps of the equations but the first, shape (N,).
-        straight: largest displacement of the first step [m], zero if it was cut.
+        straight: largest displacement of the first step [m], zero if the line search shortened it.
         norm: that of the last Newton step [m].
         length: part of it that was taken.
         short: number of short steps in a row.

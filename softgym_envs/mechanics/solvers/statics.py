@@ -57,9 +57,8 @@ class Statics:
         tolerance: largest remaining correction of any node at convergence [m].
         max_iterations: limit of Newton iterations per load increment.
         max_halvings: the smallest load increment is ``0.5 ** max_halvings`` of the whole step.
-        exact_compliance: compute ``W`` at each equilibrium. Otherwise it may be that of the last iterate, which saves a
-            factorisation; without friction, `exact_compliance.exact_at` computes it later. In contact the same holds
-            for stability. Without, the factorisation is left out only far from where the body would buckle.
+        exact_compliance: compute ``W`` and stability at each equilibrium. Otherwise they may be those of the last
+            iterate, which saves a factorisation; without friction, `exact_compliance.exact_at` computes them later.
         compiled: solve bodies of beams in compiled code (`BeamMotion`) where that converges fast; it gives the same
             equilibria to the tolerance.
 
@@ -240,7 +239,7 @@ class Statics:
                     raise NewtonFailure
             self.x, self.effort = x, effort
             near = iteration > 1 and length == 1.0 and remaining <= self.tolerance  # to the last factorisation
-            if near and not self.exact_compliance and linear.is_far_from_singular():
+            if near and not self.exact_compliance and linear.positive_definite:
                 linear.follow(assembled)
                 return iteration
             if not linear.factorise(assembled, x, definite=definite):
@@ -463,7 +462,7 @@ class Statics:
         linear = self.linearisation
         if self._elasticity_version != self.model.elasticity_version:
             self._elasticity_version = self.model.elasticity_version
-            linear.current, linear.first_response = False, None
+            linear.current = False
         loads, start_loads = self.model.loads, linear.loads
         ramped, carried = bool((loads != start_loads).any()), start_loads
         if not linear.current and not self._linearise():
