@@ -296,7 +296,7 @@ def test_an_attack_finds_what_random_states_do_not(trunk, monkeypatch):
     robot = model.robot
     columns = [robot.design_space.names.index(name) for name in ("module_length", "outer_radius")]
 
-    def solve(robot, commands, folder):
+    def solve(robot, commands, folder, workers):
         count, states, n = commands.command.shape
         design = np.repeat(commands.design, states, axis=0)
         command = commands.command.reshape(-1, n)
@@ -372,7 +372,7 @@ def test_searches_go_on_below_the_limit_that_the_last_one_left(trunk, tmp_path, 
     monkeypatch.setattr(module, "judged_states", lambda *_, **__: JudgedStates.join(known))
     limits = []
 
-    def search(model, count, states, seed, folder, number):
+    def search(model, count, states, seed, folder, number, workers):
         limits.append(model.domain.limit)
         found = predicted_states(model, "corners", 10, 4, 50 + number, errors(3e-3 if number == 1 else 1e-4))
         return replace(found, stratum=np.full(40, "adversarial"))
