@@ -393,7 +393,8 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
     if config.trust is not None:
         from softgym_envs.surrogate.calibration import calibrate
 
-        calibrate(folder, robot, **config.trust.model_dump(), state_folder=data_folder / "judged")
+        options = config.trust.model_dump()
+        calibrate(folder, robot, **options, state_folder=data_folder / "judged", workers=config.workers)
     shutil.rmtree(folder / "parts", ignore_errors=True)
     return errors
 
