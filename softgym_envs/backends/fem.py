@@ -343,6 +343,7 @@ class FEMBackend(Backend):
         self, equilibrium: Equilibrium, command: np.ndarray, motion: Motion | None = None, *, still: bool = False
     ) -> State:
         condensed, slices, statics = equilibrium.condensed, equilibrium.condensed.slices, self._statics
+        exact = equilibrium.conditions is None
         effector = equilibrium.delta[slices["e"]].reshape(-1, 3)
         velocity = np.zeros_like(effector)
         if motion is not None and not still:
@@ -365,9 +366,7 @@ class FEMBackend(Backend):
             effort=equilibrium.effort[slices["a"]],
             effector=effector,
             slack=equilibrium.slack,
-            condensed=condensed
-            if equilibrium.conditions is None
-            else (lambda: exact_at(statics, equilibrium).condensed),
+            condensed=condensed if exact else (lambda: exact_at(statics, equilibrium).condensed),
             nodes=equilibrium.x,
             velocity=velocity,
             motion=motion,

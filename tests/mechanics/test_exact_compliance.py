@@ -149,3 +149,14 @@ def test_another_elasticity_gives_another_compliance(capped):
     near.solve([1e-3])
     again = near.solve([2e-3])
     assert exact_at(near, again).condensed.compliance != pytest.approx(found.condensed.compliance)
+
+
+def test_friction_that_cables_get_later_does_not_change_an_earlier_state():
+    model = make_robot("finger").build()
+    exact, near = Statics(model), Statics(model, exact_compliance=False)
+    expected, found = ([statics.solve([x, x]) for x in (3.0e-3, 3.1e-3, 3.2e-3)] for statics in (exact, near))
+    for cable in model.constraints["a"]:
+        cable.friction = 0.2
+    for own, known in zip(found, expected, strict=True):
+        assert own.conditions is not None
+        agree(exact_at(near, own), known)
