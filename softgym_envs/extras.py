@@ -49,11 +49,12 @@ def require(extra: str) -> None:
         MissingLibrary: one line that says what to install.
     """
     for module in EXTRAS[extra]:
-        if not _installed(module):
+        if not installed(module):
             raise MissingLibrary(_missing(module, extra))
 
 
-def _installed(module: str) -> bool:
+def installed(module: str) -> bool:
+    """Return whether a module can be imported, without importing it."""
     if module in sys.modules:  # some modules have no specification once they are imported
         return sys.modules[module] is not None
     return find_spec(module) is not None

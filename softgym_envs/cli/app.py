@@ -8,7 +8,7 @@ from typing import NoReturn
 
 import click
 
-from softgym_envs.cli import agents, bench, benchmark, codesign, configs, environments, robots, surrogates
+from softgym_envs.cli import agents, bench, benchmark, codesign, configs, doctor, environments, robots, surrogates
 from softgym_envs.cli.options import Resumable, Verbs
 from softgym_envs.errors import SoftGymError
 from softgym_envs.extras import explain
@@ -28,7 +28,7 @@ SECTIONS = {
     "Design and control": (codesign.codesign, codesign.optimise, codesign.sensitivity, codesign.calibrate),
     "Benchmark": (benchmark.benchmark,),
     "Configurations": (configs.configs,),
-    "Development": (bench.bench,),
+    "Development": (doctor.doctor, bench.bench),
 }
 
 
