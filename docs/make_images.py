@@ -28,7 +28,7 @@ from benchmarks import convergence_tables, grown_shapes, structures
 from softgym_envs import make_robot
 from softgym_envs.agents.evaluation import make_agent
 from softgym_envs.backends import make_backend
-from softgym_envs.codesign.benchmark import plots
+from softgym_envs.extensions.leaderboard import plots
 from softgym_envs.mechanics import Statics
 from softgym_envs.mechanics.elements.tetrahedra import boundary_triangles
 from softgym_envs.robots import ROBOTS

@@ -26,7 +26,7 @@ PACKAGES = {
     "softgym_envs.viewer": "Pictures",
     "softgym_envs.agents": "Agents",
     "softgym_envs.codesign": "Co-design",
-    "softgym_envs.codesign.benchmark": "Benchmark of co-design",
+    "softgym_envs.extensions.leaderboard": "Benchmark of co-design",
 }
 """Packages that export public names and the module of the exceptions, with the titles of their pages."""
 

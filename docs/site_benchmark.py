@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from softgym_envs.codesign.benchmark import board
+from softgym_envs.extensions.leaderboard import board
 
 PARTS = {
     "tracks": board.tracks,

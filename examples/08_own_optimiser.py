@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from softgym_envs.codesign.benchmark import Search, load_problem, submit
+from softgym_envs.extensions.leaderboard import Search, load_problem, submit
 
 problem = load_problem("finger-zone-v1")
 search = Search(problem, level="small", judge="shared")  # a shared policy: milliseconds a body

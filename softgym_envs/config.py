@@ -285,7 +285,7 @@ def commit_of(root: Path) -> str | None:
     return None
 
 
-_NOT_SOURCES = ("configs", "agents/results", "codesign/benchmark/data")
+_NOT_SOURCES = ("configs", "agents/results", "extensions/leaderboard/data")
 """Folders of the package that results do not follow from: a run keeps its configuration, and the others are records."""
 
 

@@ -1,14 +1,17 @@
-"""Registries: classes found by name, registered in code or through entry points of other packages."""
+"""Registries: objects and classes found by name, registered in code or through entry points of installed packages.
+
+The suite's own extensions (`softgym_envs.extensions`) are found through the same entry points as packages of others.
+"""
 
 from __future__ import annotations
 
 import inspect
 import numbers
 import types
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache, partial
 from importlib import import_module
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
@@ -16,10 +19,76 @@ from softgym_envs.errors import unknown_name
 from softgym_envs.wording import counted
 
 
-class Registry(Mapping[str, type]):
-    """A table of classes by name; each class is imported when it is first used.
+class Table(Mapping[str, Any]):
+    """Objects by name: those given here, and those that installed packages add; each is imported when first used.
 
-    Installed packages add classes through entry points; the name of the entry point is the registered name.
+    Installed packages add objects through entry points; the name of the entry point is the name in the table.
+
+    Args:
+        kind: what the table holds, for messages: ``"robot"``, ...
+        entries: name -> object, or ``"module:object"``.
+        group: group of entry points; none by default.
+    """
+
+    def __init__(self, kind: str, entries: Mapping[str, Any], *, group: str = "") -> None:
+        self.kind = kind
+        self._entries: dict[str, Any] = dict(entries)
+        self._group = group
+        self._discovered = not group
+
+    def find(self, name: str) -> Any:
+        """Return the object with a name.
+
+        Raises:
+            ValueError: for an unknown name, one that two packages claim, or an object of the wrong kind.
+        """
+        if name not in self:
+            raise ValueError(unknown_name(self.kind, name, self))
+        return self[name]
+
+    def __getitem__(self, name: str) -> Any:
+        if name not in self:
+            raise KeyError(name)
+        found = self._entries[name]
+        return self._checked(import_object(self.kind, found) if isinstance(found, str) else found)
+
+    def __contains__(self, name: object) -> bool:
+        self._discover()
+        return name in self._entries
+
+    def __iter__(self) -> Iterator[str]:
+        self._discover()
+        return iter(self._entries)
+
+    def __len__(self) -> int:
+        self._discover()
+        return len(self._entries)
+
+    def _checked(self, found: Any) -> Any:
+        """Return an object of the table, or raise ValueError for one of the wrong kind."""
+        return found
+
+    def _discover(self) -> None:
+        """Add the entry points of installed packages, once; they are not imported.
+
+        Raises:
+            ValueError: for a name that belongs to another object.
+        """
+        if self._discovered:
+            return
+        for point in entry_points(group=self._group):
+            existing = self._entries.setdefault(point.name, point.value)
+            if _path(existing) != point.value:
+                owner = point.dist.name if point.dist is not None else "unknown"
+                raise ValueError(
+                    f"{self.kind} '{point.name}' is {_path(existing)} and also {point.value}, an entry point of the "
+                    f"package '{owner}': rename or remove one of them"
+                )
+        self._discovered = True
+
+
+class Registry(Table):
+    """A table of classes by name, which makes their objects.
 
     Args:
         kind: what the table holds, for messages: ``"robot"``, ...
@@ -29,11 +98,8 @@ class Registry(Mapping[str, type]):
     """
 
     def __init__(self, kind: str, entries: Mapping[str, str], *, base: str, group: str = "") -> None:
-        self.kind = kind
-        self._entries: dict[str, str | type] = dict(entries)
+        super().__init__(kind, entries, group=group)
         self._base = base
-        self._group = group
-        self._discovered = not group
 
     def register(self, name_or_class: Any = None, entry: str | type | None = None) -> Any:
         """Add a class: ``register(Arm)``, ``register("arm", Arm)``, or a decorator with or without the name.
@@ -59,6 +125,7 @@ class Registry(Mapping[str, type]):
         else:
             cls = self._checked(cls)
             name = self._name_of(cls, name)
+        self._discover()
         existing = self._entries.get(name, cls)
         if _path(existing) != _path(cls):
             raise ValueError(f"{self.kind} '{name}' is already registered: {_path(existing)}")
@@ -73,13 +140,10 @@ class Registry(Mapping[str, type]):
         """
         if not isinstance(name_or_class, str):
             return self._checked(name_or_class)
-        if name_or_class in self:
-            found = self._entries[name_or_class]
-        elif ":" in name_or_class:
-            found = name_or_class
-        else:
-            raise ValueError(unknown_name(self.kind, name_or_class, self))
-        return self._checked(import_object(self.kind, found) if isinstance(found, str) else found)
+        if ":" in name_or_class and name_or_class not in self:
+            return self._checked(import_object(self.kind, name_or_class))
+        found: type = self.find(name_or_class)
+        return found
 
     def class_of(self, source: object) -> Any:
         """Return the class for a registered name, a path, a class or an object, see `resolve`."""
@@ -113,43 +177,7 @@ class Registry(Mapping[str, type]):
         check_options(f"{self.kind} '{shown}'", cls, len(arguments), options)
         return cls(*arguments, **options)
 
-    # -- mapping ----------------------------------------------------------------------------------------------------
-
-    def __getitem__(self, name: str) -> type:
-        if name not in self:
-            raise KeyError(name)
-        return self.resolve(name)
-
-    def __contains__(self, name: object) -> bool:
-        if name not in self._entries:
-            self._discover()
-        return name in self._entries
-
-    def __iter__(self) -> Iterator[str]:
-        self._discover()
-        return iter(self._entries)
-
-    def __len__(self) -> int:
-        self._discover()
-        return len(self._entries)
-
     # -- details ----------------------------------------------------------------------------------------------------
-
-    def _discover(self) -> None:
-        """Add the entry points of installed packages, once. Names already taken keep their class."""
-        if self._discovered:
-            return
-        from importlib.metadata import entry_points
-
-        self._discovered = True
-        for point in entry_points(group=self._group):
-            existing = self._entries.setdefault(point.name, point.value)
-            if _path(existing) != point.value:
-                warnings.warn(
-                    f"{self.kind} '{point.name}' of the entry point {point.value} is ignored: "
-                    f"the name belongs to {_path(existing)}",
-                    stacklevel=3,
-                )
 
     def _base_class(self) -> type:
         module, _, name = self._base.partition(":")
@@ -265,8 +293,11 @@ def _shown(cls: type) -> str:
     return getattr(cls, "name", cls.__name__)
 
 
-def _path(entry: str | type) -> str:
-    return entry if isinstance(entry, str) else f"{entry.__module__}:{entry.__qualname__}"
+def _path(entry: Any) -> str:
+    if isinstance(entry, str):
+        return entry
+    owner = entry if hasattr(entry, "__qualname__") else type(entry)
+    return f"{owner.__module__}:{owner.__qualname__}"
 
 
 def _is_a(value: object, annotation: Any) -> bool:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import tomllib
 from collections import defaultdict
+from importlib.metadata import entry_points
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -39,6 +41,11 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
+    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
+    for group, points in project["entry-points"].items():
+        if not points.items() <= {(point.name, point.value) for point in entry_points(group=group)}:
+            pip = "python -m pip install --no-deps --no-build-isolation -e ."
+            raise pytest.UsageError(f"the installed package is older than pyproject.toml ({group}): run {pip}")
     if config.getoption("update_slow_tests") and not hasattr(config, "workerinput"):
         config.pluginmanager.register(SlowTestsWriter())
 

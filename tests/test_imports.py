@@ -30,6 +30,7 @@ LAYERS = [
     {"softgym_envs.codesign"},
     {"softgym_envs.viewer", "softgym_envs.testing"},
     {"softgym_envs.cli"},
+    {"softgym_envs.extensions"},
 ]
 LEVEL = {package: level for level, layer in enumerate(LAYERS) for package in layer}
 # The viewer is imported only inside the functions that draw.

@@ -16,10 +16,10 @@ PACKAGES = [
     "softgym_envs.agents",
     "softgym_envs.backends",
     "softgym_envs.codesign",
-    "softgym_envs.codesign.benchmark",
     "softgym_envs.control",
     "softgym_envs.envs",
     "softgym_envs.estimation",
+    "softgym_envs.extensions.leaderboard",
     "softgym_envs.mechanics",
     "softgym_envs.robots",
     "softgym_envs.robots.modules",
@@ -77,7 +77,7 @@ def test_all_packages_with_public_names_are_listed():
         ".".join(path.parent.relative_to(ROOT).parts)
         for path in [ROOT / "softgym_envs" / "__init__.py", *(ROOT / "softgym_envs").glob("*/__init__.py")]
         + [
-            *(ROOT / "softgym_envs").glob("*/benchmark/__init__.py"),
+            *(ROOT / "softgym_envs").glob("extensions/*/__init__.py"),
             *(ROOT / "softgym_envs").glob("*/modules/__init__.py"),
         ]
         if "lazy_exports(" in path.read_text() or re.search(r"^__all__ = \[", path.read_text(), flags=re.MULTILINE)

@@ -13,8 +13,8 @@ import pytest
 
 from benchmarks import run
 from benchmarks.recorded import SOURCES
-from softgym_envs.codesign.benchmark.scoring import DATA
 from softgym_envs.errors import ConfigError
+from softgym_envs.extensions.leaderboard.scoring import DATA
 
 ENTRIES = [(path.name, name, entry) for path in SOURCES for name, entry in json.loads(path.read_text()).items()]
 
@@ -24,7 +24,7 @@ ROOT = Path(__file__).parent.parent
 
 REWRITTEN = {
     "benchmarks/data/recorded.json zigzag_robust",
-    "codesign/benchmark/data/references/cable-trunk-reach-v2.json found",
+    "softgym_envs/extensions/leaderboard/data/references/cable-trunk-reach-v2.json found",
     "softgym_envs/surrogate/chain/weights/contact_aided_finger/model.json provenance",
     "softgym_envs/surrogate/weights/sensorized_finger_2cavities_touched/model.json provenance",
 }

@@ -188,9 +188,12 @@ def test_entry_points_of_installed_packages(tmp_path, monkeypatch):
     (info / "entry_points.txt").write_text("[tests.shapes]\nstar = their_shapes:Star\ndisc = their_shapes:Disc\n")
     monkeypatch.syspath_prepend(tmp_path)
     registry = Registry("shape", {"disc": f"{__name__}:Disc"}, base=BASE, group="tests.shapes")
-    assert registry.make("disc").radius == 1.0  # names of this package are found without a search
-    with pytest.warns(UserWarning, match="'disc' of the entry point their_shapes:Disc is ignored: the name belongs to"):
-        assert list(registry) == ["disc", "star"]
+    both = "shape 'disc' is .*:Disc and also their_shapes:Disc, an entry point of the package 'their-shapes': rename"
+    for _ in range(2):
+        with pytest.raises(ValueError, match=both):
+            registry.make("disc")
+    registry = Registry("shape", {"square": f"{__name__}:Disc"}, base=BASE, group="tests.shapes")
+    assert list(registry) == ["square", "star", "disc"]
     assert "their_shapes" not in sys.modules
     assert registry.make("star", radius=2.0).name == "star"
 

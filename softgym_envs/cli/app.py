@@ -8,38 +8,75 @@ from typing import NoReturn
 
 import click
 
-from softgym_envs.cli import agents, bench, benchmark, codesign, configs, doctor, environments, robots, surrogates
 from softgym_envs.cli.options import Resumable, Verbs
 from softgym_envs.errors import SoftGymError
 from softgym_envs.extras import explain
+from softgym_envs.registry import Table
 from softgym_envs.version import __version__
 
 SECTIONS = {
-    "Environments": (environments.list_, environments.rollout, environments.record, environments.view),
-    "Robots": (robots.show, robots.export),
-    "Surrogates": (
-        surrogates.dataset,
-        surrogates.fit,
-        surrogates.fit_inertia,
-        surrogates.calibrate_trust,
-        surrogates.deploy,
-    ),
-    "Agents": (agents.train, agents.evaluate, agents.results, agents.deploy_policy),
-    "Design and control": (codesign.codesign, codesign.optimise, codesign.sensitivity, codesign.calibrate),
-    "Benchmark": (benchmark.benchmark,),
-    "Configurations": (configs.configs,),
-    "Development": (doctor.doctor, bench.bench),
+    "Environments": {
+        "list": "environments:list_",
+        "rollout": "environments:rollout",
+        "record": "environments:record",
+        "view": "environments:view",
+    },
+    "Robots": {
+        "show": "robots:show",
+        "export": "robots:export",
+    },
+    "Surrogates": {
+        "dataset": "surrogates:dataset",
+        "fit": "surrogates:fit",
+        "fit-inertia": "surrogates:fit_inertia",
+        "calibrate-trust": "surrogates:calibrate_trust",
+        "deploy": "surrogates:deploy",
+    },
+    "Agents": {
+        "train": "agents:train",
+        "evaluate": "agents:evaluate",
+        "results": "agents:results",
+        "deploy-policy": "agents:deploy_policy",
+    },
+    "Design and control": {
+        "codesign": "codesign:codesign",
+        "optimise": "codesign:optimise",
+        "sensitivity": "codesign:sensitivity",
+        "calibrate": "codesign:calibrate",
+    },
+    "Configurations": {
+        "configs": "configs:configs",
+    },
+    "Development": {
+        "doctor": "doctor:doctor",
+        "bench": "bench:bench",
+    },
 }
+"""Title in the help -> verb -> its place in `softgym_envs.cli`."""
+
+VERBS = Table(
+    "verb",
+    {verb: f"softgym_envs.cli.{place}" for verbs in SECTIONS.values() for verb, place in verbs.items()},
+    group="softgym_envs.verbs",
+)
+"""All verbs by name, which are `click` commands: those of `SECTIONS` and those of installed packages."""
 
 
 class _Verbs(Verbs):
-    """The group of all verbs, whose help lists them by section."""
+    """The group of all verbs, whose help lists them by section; a verb is imported when it is used or listed."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(VERBS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        return VERBS[cmd_name] if cmd_name in VERBS else None
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        width = max(map(len, self.commands))  # all sections share the same two columns
-        for title, verbs in SECTIONS.items():
+        width = max(map(len, VERBS))  # all sections share the same two columns
+        others = set(VERBS).difference(*SECTIONS.values())
+        for title, verbs in {**SECTIONS, "Extensions": sorted(others)}.items():
             with formatter.section(title):
-                formatter.write_dl([(f"{verb.name:{width}}", verb.get_short_help_str(80)) for verb in verbs])
+                formatter.write_dl([(f"{verb:{width}}", VERBS[verb].get_short_help_str(80)) for verb in verbs])
 
 
 @click.group(
@@ -53,11 +90,6 @@ def cli(ctx: click.Context) -> None:
     """Optimise the body and the controller of a soft robot together."""
     if ctx.invoked_subcommand is None:
         click.echo(ctx.get_help())
-
-
-for _verbs in SECTIONS.values():
-    for _verb in _verbs:
-        cli.add_command(_verb)
 
 
 def main() -> None:

@@ -23,7 +23,6 @@ CONFIGS = Path(__file__).parents[1] / "configs"
 
 VERBS = {
     "agents": "train, evaluate",
-    "benchmark": "benchmark",
     "codesign": "codesign",
     "design": "optimise, sensitivity, calibrate",
     "surrogate": "dataset, fit",
@@ -37,8 +36,9 @@ class Verbs(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        if args[0] not in self.commands and not args[0].startswith("-"):
-            raise click.UsageError(unknown_name("verb", args[0], self.commands), ctx)
+        verbs = self.list_commands(ctx)
+        if args[0] not in verbs and not args[0].startswith("-"):
+            raise click.UsageError(unknown_name("verb", args[0], verbs), ctx)
         return super().resolve_command(ctx, args)
 
 

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from softgym_envs.codesign.benchmark.frozen import FrozenProblem, load_problem, problem_names
-from softgym_envs.codesign.benchmark.runs import Run, stored_runs, tested
-from softgym_envs.codesign.benchmark.scoring import DATA
-from softgym_envs.codesign.benchmark.table import Tabulation, tabulated
 from softgym_envs.codesign.records import Record
+from softgym_envs.extensions.leaderboard.frozen import FrozenProblem, load_problem, problem_names
+from softgym_envs.extensions.leaderboard.runs import Run, stored_runs, tested
+from softgym_envs.extensions.leaderboard.scoring import DATA
+from softgym_envs.extensions.leaderboard.table import Tabulation, tabulated
 from softgym_envs.storage import atomic_write, read_json
 
 FILE = "winners.json"

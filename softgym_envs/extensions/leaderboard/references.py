@@ -7,17 +7,17 @@ from pathlib import Path
 
 import numpy as np
 
-from softgym_envs.codesign.benchmark.frozen import FrozenProblem, load_problem
-from softgym_envs.codesign.benchmark.runs import Run, stored_runs, tested
-from softgym_envs.codesign.benchmark.scoring import (
+from softgym_envs.extensions.leaderboard.frozen import FrozenProblem, load_problem
+from softgym_envs.extensions.leaderboard.runs import Run, stored_runs, tested
+from softgym_envs.extensions.leaderboard.scoring import (
     DATA,
     Reference,
     make_reference,
     merit,
     write_reference,
 )
-from softgym_envs.codesign.benchmark.submission import is_better
-from softgym_envs.codesign.benchmark.table import Tabulation
+from softgym_envs.extensions.leaderboard.submission import is_better
+from softgym_envs.extensions.leaderboard.table import Tabulation
 
 
 def promising(name: str, data: Path = DATA) -> Run:
@@ -63,7 +63,7 @@ def check_accurate(name: str, data: Path = DATA, longest: float = 0.5) -> Refere
     Both are scored where the inverse QP comes to rest, on the test goals.
 
     Args:
-        name: a problem that can be tabulated, see `softgym_envs.codesign.benchmark.table.Tabulation`.
+        name: a problem that can be tabulated, see `softgym_envs.extensions.leaderboard.table.Tabulation`.
         data: folder of the references.
         longest: largest step towards rest, relative to the range of a command.
 

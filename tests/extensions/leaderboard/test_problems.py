@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import yaml
 
-from softgym_envs.codesign.benchmark import Search, load_problem, problem_names
-from softgym_envs.codesign.benchmark.frozen import freeze, load_definition
-from softgym_envs.codesign.benchmark.problem import GOAL_SETS, TRACKS, Score, goal_key
-from softgym_envs.codesign.benchmark.search import METHODS, BudgetSpent, make_optimiser, solve
 from softgym_envs.errors import ConfigError, DataError, DesignError
-from tests.codesign.benchmark.conftest import tiny_definition
+from softgym_envs.extensions.leaderboard import Search, load_problem, problem_names
+from softgym_envs.extensions.leaderboard.frozen import freeze, load_definition
+from softgym_envs.extensions.leaderboard.problem import GOAL_SETS, TRACKS, Score, goal_key
+from softgym_envs.extensions.leaderboard.search import METHODS, BudgetSpent, make_optimiser, solve
+from tests.extensions.leaderboard.conftest import tiny_definition
 
 NAMES = problem_names()
 
@@ -175,7 +175,7 @@ def test_methods_of_other_packages_find_a_better_body_than_the_baseline(method):
 
 @pytest.mark.parametrize("method", JOINT)
 def test_joint_methods_train_first_and_count_the_steps(tiny, problems, method):
-    from softgym_envs.codesign.benchmark.joint import EPISODES, REPORTS, JointOptimiser
+    from softgym_envs.extensions.leaderboard.joint import EPISODES, REPORTS, JointOptimiser
 
     optimiser = JointOptimiser(tiny, 0, method, steps=300)
     optimiser.steps_left = 100.0
@@ -190,7 +190,7 @@ def test_joint_methods_train_first_and_count_the_steps(tiny, problems, method):
 
 
 def test_children_inherit_the_policies_of_their_parents(tiny, monkeypatch):
-    from softgym_envs.codesign.benchmark import problem as module
+    from softgym_envs.extensions.leaderboard import problem as module
 
     started, real = [], module.train
     monkeypatch.setattr(

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.agents.statistics import Estimate, interquartile_mean, stratified_estimate
-from softgym_envs.codesign.benchmark.frozen import FrozenProblem, load_problem
-from softgym_envs.codesign.benchmark.runs import Run
-from softgym_envs.codesign.benchmark.scoring import (
+from softgym_envs.extensions.leaderboard.frozen import FrozenProblem, load_problem
+from softgym_envs.extensions.leaderboard.runs import Run
+from softgym_envs.extensions.leaderboard.scoring import (
     DATA,
     Reference,
     bounds_share,

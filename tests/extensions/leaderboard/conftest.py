@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 import yaml
 
-from softgym_envs.codesign.benchmark import frozen
+from softgym_envs.extensions.leaderboard import frozen
 
 ROOT = Path(__file__).parents[3]
-SHIPPED = ROOT / "configs" / "benchmark"
+SHIPPED = ROOT / "softgym_envs" / "extensions" / "leaderboard" / "problems"
 
 
 def tiny_definition(**changes):

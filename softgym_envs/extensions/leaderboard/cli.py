@@ -31,7 +31,7 @@ def benchmark() -> None:
 @benchmark.command(name="list")
 def list_() -> None:
     """List the problems."""
-    from softgym_envs.codesign.benchmark.frozen import load_definition, problem_names
+    from softgym_envs.extensions.leaderboard.frozen import load_definition, problem_names
 
     click.echo(f"{'problem':28s} {'track':5s} {'variables':>9s} {'judge':8s} title")
     for name in problem_names():
@@ -43,9 +43,9 @@ def list_() -> None:
 @click.argument("name")
 def show(name: str) -> None:
     """Show a problem: its box, budgets, hashes and what is known about it."""
-    from softgym_envs.codesign.benchmark.frozen import load_problem
-    from softgym_envs.codesign.benchmark.problem import TRACKS
-    from softgym_envs.codesign.benchmark.scoring import reference
+    from softgym_envs.extensions.leaderboard.frozen import load_problem
+    from softgym_envs.extensions.leaderboard.problem import TRACKS
+    from softgym_envs.extensions.leaderboard.scoring import reference
 
     problem = load_problem(name)
     definition = problem.definition
@@ -100,9 +100,9 @@ def run(
 
     An interrupted call continues where it stopped.
     """
-    from softgym_envs.codesign.benchmark import references, runs
-    from softgym_envs.codesign.benchmark.frozen import load_definition
-    from softgym_envs.codesign.benchmark.table import Table
+    from softgym_envs.extensions.leaderboard import references, runs
+    from softgym_envs.extensions.leaderboard.frozen import load_definition
+    from softgym_envs.extensions.leaderboard.table import Table
 
     require("codesign")
     listed = None if table is None else Table.read(names[0], table)
@@ -131,7 +131,7 @@ def judges(name: str, bodies: int, folder: Path) -> None:
 
     These policies are trained for each body.
     """
-    from softgym_envs.codesign.benchmark import runs
+    from softgym_envs.extensions.leaderboard import runs
 
     with options.resumable():
         found = runs.judges(folder, name, bodies)
@@ -152,7 +152,7 @@ def winners(names: tuple[str, ...], every: tuple[str, ...], rest: bool, store: b
     `small`. Exploitation is the score on the learned model minus that on finite elements. An interrupted call continues
     where it stopped.
     """
-    from softgym_envs.codesign.benchmark import winners as module
+    from softgym_envs.extensions.leaderboard import winners as module
 
     for name in names:
         with options.resumable():
@@ -178,9 +178,9 @@ def reference_(names: tuple[str, ...], accurate: bool, folder: Path) -> None:
     0 is the baseline body. 1 is the winner of the stored searches that is best on the validation goals, unless a better
     body is already known. Both are tested on finite elements, on the test goals.
     """
-    from softgym_envs.codesign.benchmark import references
-    from softgym_envs.codesign.benchmark.frozen import load_problem
-    from softgym_envs.codesign.benchmark.scoring import make_reference
+    from softgym_envs.extensions.leaderboard import references
+    from softgym_envs.extensions.leaderboard.frozen import load_problem
+    from softgym_envs.extensions.leaderboard.scoring import make_reference
 
     for name in names:
         with options.resumable():
@@ -198,7 +198,7 @@ def verify(path: Path, record: bool, as_json: bool) -> None:
     """Check a submission: run its bodies again on finite elements."""
     from dataclasses import asdict
 
-    from softgym_envs.codesign.benchmark import verify as check
+    from softgym_envs.extensions.leaderboard import verify as check
 
     verdict = check(path, record=record)
     if as_json:
@@ -218,7 +218,7 @@ def table_(folder: Path, store: bool) -> None:
 
     Where the default folder has no runs, those that ship with the package.
     """
-    from softgym_envs.codesign.benchmark import board, runs
+    from softgym_envs.extensions.leaderboard import board, runs
 
     own = (folder / "runs").is_dir()
     if not own and folder != FOLDER:
@@ -235,7 +235,7 @@ def table_(folder: Path, store: bool) -> None:
 @click.argument("paths", nargs=-1, type=options.PATH)
 def board_(paths: tuple[Path, ...]) -> None:
     """Show the leaderboard, and where the submissions in the files PATHS would stand."""
-    from softgym_envs.codesign.benchmark import board
+    from softgym_envs.extensions.leaderboard import board
 
     click.echo(board.leaderboard(more=paths))
 
@@ -249,8 +249,8 @@ def freeze(names: tuple[str, ...], keep: bool) -> None:
     Some changes alter the hash but no score, such as another spelling of an option. With --keep, some stored winners
     are scored again; if no score differs, the stored results get the new hash.
     """
-    from softgym_envs.codesign.benchmark import frozen
-    from softgym_envs.codesign.benchmark.refreeze import refreeze
+    from softgym_envs.extensions.leaderboard import frozen
+    from softgym_envs.extensions.leaderboard.refreeze import refreeze
 
     for name in names:
         for path in refreeze(name) if keep else [frozen.freeze(name)]:
@@ -304,7 +304,7 @@ def tabulate(
     Each judge scores the first bodies of one Sobol sequence. An interrupted call continues where it stopped, and a call
     with more bodies adds to what is there.
     """
-    from softgym_envs.codesign.benchmark.table import tabulate as run
+    from softgym_envs.extensions.leaderboard.table import tabulate as run
 
     chosen = _counts("--best", best), _counts("--ranked", ranked)
     with options.resumable():

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from softgym_envs.codesign.benchmark.frozen import load_problem
-from softgym_envs.codesign.benchmark.plots import _changes, _Panel, _plane
+from softgym_envs.extensions.leaderboard.frozen import load_problem
+from softgym_envs.extensions.leaderboard.plots import _changes, _Panel, _plane
 from softgym_envs.mechanics.elements.tetrahedra import boundary_triangles
 
 

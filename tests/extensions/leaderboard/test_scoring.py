@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from softgym_envs.codesign.benchmark import board, regret, runs
-from softgym_envs.codesign.benchmark import table as table_module
-from softgym_envs.codesign.benchmark.frozen import load_problem
-from softgym_envs.codesign.benchmark.problem import Score
-from softgym_envs.codesign.benchmark.scoring import Reference, front, hypervolume, improvement, normalised
-from softgym_envs.codesign.benchmark.search import make_optimiser, solve
-from softgym_envs.codesign.benchmark.table import Table, TableSearch, tabulate
 from softgym_envs.errors import DataError
+from softgym_envs.extensions.leaderboard import board, regret, runs
+from softgym_envs.extensions.leaderboard import table as table_module
+from softgym_envs.extensions.leaderboard.frozen import load_problem
+from softgym_envs.extensions.leaderboard.problem import Score
+from softgym_envs.extensions.leaderboard.scoring import Reference, front, hypervolume, improvement, normalised
+from softgym_envs.extensions.leaderboard.search import make_optimiser, solve
+from softgym_envs.extensions.leaderboard.table import Table, TableSearch, tabulate
 
 
 def test_hypervolume_of_known_sets():

@@ -5,8 +5,8 @@ import math
 
 import pytest
 
-from softgym_envs.codesign.benchmark import board, frozen, references, refreeze, runs, scoring, winners
 from softgym_envs.errors import DataError
+from softgym_envs.extensions.leaderboard import board, frozen, references, refreeze, runs, scoring, winners
 
 
 def test_winners_are_scored_on_both_models_and_stored(tiny, tmp_path):

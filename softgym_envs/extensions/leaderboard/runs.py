@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from softgym_envs.codesign.benchmark.frozen import FrozenProblem, load_problem, problem_names
-from softgym_envs.codesign.benchmark.problem import Judge, Score
-from softgym_envs.codesign.benchmark.scoring import DATA, front
-from softgym_envs.codesign.benchmark.search import Search, make_optimiser, solve
-from softgym_envs.codesign.benchmark.table import Table, TableSearch
 from softgym_envs.codesign.records import Record
 from softgym_envs.config import provenance
+from softgym_envs.extensions.leaderboard.frozen import FrozenProblem, load_problem, problem_names
+from softgym_envs.extensions.leaderboard.problem import Judge, Score
+from softgym_envs.extensions.leaderboard.scoring import DATA, front
+from softgym_envs.extensions.leaderboard.search import Search, make_optimiser, solve
+from softgym_envs.extensions.leaderboard.table import Table, TableSearch
 from softgym_envs.storage import atomic_write, read_json, write_json
 
 
@@ -28,7 +28,7 @@ class Run(Record):
     Attributes:
         problem: ID with its version.
         hash: of the frozen problem.
-        method: key of `softgym_envs.codesign.benchmark.search.METHODS`.
+        method: key of `softgym_envs.extensions.leaderboard.search.METHODS`.
         judge: who controlled the bodies in the search.
         level: name of the budget.
         seed: of the optimiser and of trainings.

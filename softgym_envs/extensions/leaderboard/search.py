@@ -8,12 +8,12 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from softgym_envs.codesign.benchmark.clock import working_seconds
-from softgym_envs.codesign.benchmark.frozen import FrozenProblem
-from softgym_envs.codesign.benchmark.problem import LEVELS, Budget, Judge, Score
 from softgym_envs.codesign.sampling import SamplerConfig, construct, make_sampler
 from softgym_envs.codesign.scheduling.optuna_study import distributions
 from softgym_envs.errors import SoftGymError, unknown_name
+from softgym_envs.extensions.leaderboard.clock import working_seconds
+from softgym_envs.extensions.leaderboard.frozen import FrozenProblem
+from softgym_envs.extensions.leaderboard.problem import LEVELS, Budget, Judge, Score
 
 if TYPE_CHECKING:
     from optuna.samplers import BaseSampler
@@ -251,7 +251,7 @@ def _optuna(name: str, **options: Any) -> Callable[[FrozenProblem, int], Optimis
 
 def _own(module: str, name: str, **options: Any) -> Callable[[FrozenProblem, int], Optimiser]:
     def make(problem: FrozenProblem, seed: int) -> Optimiser:
-        found = import_module(f"softgym_envs.codesign.benchmark.{module}")  # when needed: its packages are heavy
+        found = import_module(f"softgym_envs.extensions.leaderboard.{module}")  # when needed: its packages are heavy
         return getattr(found, name)(problem, seed, **options)
 
     return make

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from softgym_envs.codesign.benchmark.frozen import FrozenProblem
-from softgym_envs.codesign.benchmark.problem import Score
-from softgym_envs.codesign.benchmark.search import OptunaOptimiser
 from softgym_envs.codesign.sampling import construct
+from softgym_envs.extensions.leaderboard.frozen import FrozenProblem
+from softgym_envs.extensions.leaderboard.problem import Score
+from softgym_envs.extensions.leaderboard.search import OptunaOptimiser
 from softgym_envs.extras import require
 
 CELLS = 6

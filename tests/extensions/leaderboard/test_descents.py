@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from softgym_envs.codesign.benchmark.descents import SettledCost
-from softgym_envs.codesign.benchmark.frozen import load_problem
-from softgym_envs.codesign.benchmark.search import Search, make_optimiser, solve
+from softgym_envs.extensions.leaderboard.descents import SettledCost
+from softgym_envs.extensions.leaderboard.frozen import load_problem
+from softgym_envs.extensions.leaderboard.search import Search, make_optimiser, solve
 
 
 @pytest.mark.parametrize("name", ["finger-zone-v1", "diamond-reach-v1", "cable-trunk-reach-v2"])

@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
-import softgym_envs
 from softgym_envs.agents.policy import policy_path
-from softgym_envs.codesign.benchmark.problem import (
+from softgym_envs.config import load_config
+from softgym_envs.errors import ConfigError, DataError, unknown_name
+from softgym_envs.extensions.leaderboard.problem import (
     GOAL_SETS,
     BenchmarkProblem,
     Evaluator,
@@ -22,8 +23,6 @@ from softgym_envs.codesign.benchmark.problem import (
     Score,
     goal_key,
 )
-from softgym_envs.config import load_config
-from softgym_envs.errors import ConfigError, DataError, unknown_name
 from softgym_envs.storage import atomic_write, read_json
 from softgym_envs.surrogate.pretrained import pretrained_folder
 
@@ -35,7 +34,7 @@ def problem_names() -> list[str]:
 
 def _folder() -> Path:
     """Return the folder of the problems: ``NAME.yaml``, written by hand, and ``NAME.json``, what was frozen."""
-    return Path(softgym_envs.__file__).parent / "configs" / "benchmark"
+    return Path(__file__).parent / "problems"
 
 
 def load_problem(name: str, *, check: bool = True) -> FrozenProblem:

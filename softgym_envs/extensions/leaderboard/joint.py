@@ -14,10 +14,10 @@ import numpy as np
 from softgym_envs.agents.config import TrainConfig
 from softgym_envs.agents.joint import PROPOSERS
 from softgym_envs.agents.training import train
-from softgym_envs.codesign.benchmark.clock import working_seconds
-from softgym_envs.codesign.benchmark.frozen import FrozenProblem
-from softgym_envs.codesign.benchmark.problem import Score
 from softgym_envs.codesign.parts import JointConfig
+from softgym_envs.extensions.leaderboard.clock import working_seconds
+from softgym_envs.extensions.leaderboard.frozen import FrozenProblem
+from softgym_envs.extensions.leaderboard.problem import Score
 from softgym_envs.storage import read_json
 
 STEPS = 20_000

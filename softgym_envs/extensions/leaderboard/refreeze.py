@@ -7,11 +7,11 @@ from typing import cast
 
 import numpy as np
 
-from softgym_envs.codesign.benchmark.frozen import freeze, frozen_parts, load_definition, load_problem
-from softgym_envs.codesign.benchmark.problem import Judge
-from softgym_envs.codesign.benchmark.runs import stored_runs
-from softgym_envs.codesign.benchmark.scoring import DATA
 from softgym_envs.errors import DataError
+from softgym_envs.extensions.leaderboard.frozen import freeze, frozen_parts, load_definition, load_problem
+from softgym_envs.extensions.leaderboard.problem import Judge
+from softgym_envs.extensions.leaderboard.runs import stored_runs
+from softgym_envs.extensions.leaderboard.scoring import DATA
 from softgym_envs.storage import atomic_write
 
 SAME = 1e-5

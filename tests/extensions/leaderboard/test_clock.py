@@ -4,7 +4,7 @@ import time
 
 import numba
 
-from softgym_envs.codesign.benchmark.clock import working_seconds
+from softgym_envs.extensions.leaderboard.clock import working_seconds
 
 
 def test_compilation_does_not_count():

@@ -13,13 +13,13 @@ import torch
 from scipy.stats import qmc
 from torch import Tensor
 
-from softgym_envs.codesign.benchmark.clock import working_seconds
-from softgym_envs.codesign.benchmark.frozen import FrozenProblem
-from softgym_envs.codesign.benchmark.problem import Score
-from softgym_envs.codesign.benchmark.rest import settle
 from softgym_envs.codesign.tools.bodies import learned_model
 from softgym_envs.codesign.tools.box import Box
 from softgym_envs.codesign.tools.gradient import descend
+from softgym_envs.extensions.leaderboard.clock import working_seconds
+from softgym_envs.extensions.leaderboard.frozen import FrozenProblem
+from softgym_envs.extensions.leaderboard.problem import Score
+from softgym_envs.extensions.leaderboard.rest import settle
 
 if TYPE_CHECKING:
     from softgym_envs.envs.vector_env import SoftRobotVectorEnv

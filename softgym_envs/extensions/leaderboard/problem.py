@@ -14,7 +14,6 @@ from pydantic import Field, model_validator
 
 from softgym_envs.agents.config import TrainConfig
 from softgym_envs.agents.training import train
-from softgym_envs.codesign.benchmark.clock import working_seconds
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.goals import draw_goals
 from softgym_envs.codesign.parts import GoalsConfig, TrainingConfig, ZoneConfig
@@ -23,6 +22,7 @@ from softgym_envs.codesign.problem import StudyProblem, refuse
 from softgym_envs.codesign.records import Record
 from softgym_envs.config import BesideConfig, Config
 from softgym_envs.errors import ConvergenceError, DesignError, InfeasibleDesign, unknown_name
+from softgym_envs.extensions.leaderboard.clock import working_seconds
 
 Judge = Literal["qp", "shared", "trained"]
 """Who controls a body while it is scored: the inverse QP, a shared policy, or a policy trained for it."""

@@ -7,15 +7,15 @@ import pytest
 import yaml
 
 from softgym_envs.agents.policy import policy_path
-from softgym_envs.codesign.benchmark import Search, board, frozen, problem, submit, verify
-from softgym_envs.codesign.benchmark import submission as submission_module
-from softgym_envs.codesign.benchmark.frozen import file_hash
-from softgym_envs.codesign.benchmark.problem import goal_key
-from softgym_envs.codesign.benchmark.scoring import reference
-from softgym_envs.codesign.benchmark.submission import SubmissionRefused
 from softgym_envs.errors import DataError, WeightsError
+from softgym_envs.extensions.leaderboard import Search, board, frozen, problem, submit, verify
+from softgym_envs.extensions.leaderboard import submission as submission_module
+from softgym_envs.extensions.leaderboard.frozen import file_hash
+from softgym_envs.extensions.leaderboard.problem import goal_key
+from softgym_envs.extensions.leaderboard.scoring import reference
+from softgym_envs.extensions.leaderboard.submission import SubmissionRefused
 from softgym_envs.storage import read_json, write_json
-from tests.codesign.benchmark.conftest import tiny_definition
+from tests.extensions.leaderboard.conftest import tiny_definition
 
 
 @pytest.fixture

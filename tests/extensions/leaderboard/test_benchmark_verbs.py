@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from softgym_envs.codesign.benchmark import Search, submit
-from softgym_envs.codesign.benchmark.problem import TRACKS
+from softgym_envs.extensions.leaderboard import Search, submit
+from softgym_envs.extensions.leaderboard.problem import TRACKS
 
 
 def test_list_and_show(softgym, tiny):
@@ -37,7 +37,7 @@ def test_verify(softgym, tiny, tmp_path, data, monkeypatch):
     path = tmp_path / "submission.json"
     submission = submit(search, "by hand")
     submission.write(path)
-    monkeypatch.setattr("softgym_envs.codesign.benchmark.submission.DATA", data)
+    monkeypatch.setattr("softgym_envs.extensions.leaderboard.submission.DATA", data)
     status, out, _ = softgym("benchmark", "verify", path, "--json")
     assert status == 0 and len(json.loads(out)["scores"]) == 1
     submission.hash = "0" * 32

@@ -8,13 +8,15 @@ from pathlib import Path
 import numpy as np
 
 from softgym_envs.agents.statistics import Estimate, stratified_estimate
-from softgym_envs.codesign.benchmark.frozen import load_definition, load_problem, problem_names
-from softgym_envs.codesign.benchmark.problem import TRACKS
-from softgym_envs.codesign.benchmark.regret import MethodRow, Stored, contests, method_rows, track_rows
-from softgym_envs.codesign.benchmark.runs import stored_runs
-from softgym_envs.codesign.benchmark.scoring import DATA, normalised, reference
-from softgym_envs.codesign.benchmark.submission import Submission
-from softgym_envs.codesign.benchmark.table import (
+from softgym_envs.codesign.objectives import Objective
+from softgym_envs.errors import DataError
+from softgym_envs.extensions.leaderboard.frozen import load_definition, load_problem, problem_names
+from softgym_envs.extensions.leaderboard.problem import TRACKS
+from softgym_envs.extensions.leaderboard.regret import MethodRow, Stored, contests, method_rows, track_rows
+from softgym_envs.extensions.leaderboard.runs import stored_runs
+from softgym_envs.extensions.leaderboard.scoring import DATA, normalised, reference
+from softgym_envs.extensions.leaderboard.submission import Submission
+from softgym_envs.extensions.leaderboard.table import (
     BEST_SHARE,
     FEWEST_RANKED,
     TABLE_JUDGES,
@@ -22,9 +24,7 @@ from softgym_envs.codesign.benchmark.table import (
     Table,
     shipped_tables,
 )
-from softgym_envs.codesign.benchmark.winners import rank_correlation, stored_winners
-from softgym_envs.codesign.objectives import Objective
-from softgym_envs.errors import DataError
+from softgym_envs.extensions.leaderboard.winners import rank_correlation, stored_winners
 from softgym_envs.wording import counted
 
 SUBMISSIONS = DATA / "submissions"

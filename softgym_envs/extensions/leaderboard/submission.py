@@ -14,10 +14,6 @@ import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from softgym_envs.agents.policy import Policy, policy_path
-from softgym_envs.codesign.benchmark.frozen import FrozenProblem, file_hash, load_problem
-from softgym_envs.codesign.benchmark.problem import JUDGES, LEVELS, Budget, Evaluator, Score, goal_key
-from softgym_envs.codesign.benchmark.scoring import DATA, Reference, front, make_reference, normalised, write_reference
-from softgym_envs.codesign.benchmark.search import Search
 from softgym_envs.codesign.records import Record
 from softgym_envs.config import first_problem, provenance
 from softgym_envs.errors import (
@@ -29,6 +25,17 @@ from softgym_envs.errors import (
     WeightsError,
     unknown_name,
 )
+from softgym_envs.extensions.leaderboard.frozen import FrozenProblem, file_hash, load_problem
+from softgym_envs.extensions.leaderboard.problem import JUDGES, LEVELS, Budget, Evaluator, Score, goal_key
+from softgym_envs.extensions.leaderboard.scoring import (
+    DATA,
+    Reference,
+    front,
+    make_reference,
+    normalised,
+    write_reference,
+)
+from softgym_envs.extensions.leaderboard.search import Search
 from softgym_envs.storage import atomic_write, read_json
 
 TOLERANCE = {"qp": 1e-3, "shared": 1e-3, "trained": 5e-2, "policy": 1e-3}

@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from softgym_envs.agents.evaluation import evaluate
-from softgym_envs.codesign.benchmark.frozen import FrozenProblem, load_problem
-from softgym_envs.codesign.benchmark.problem import Judge, Score
-from softgym_envs.codesign.benchmark.rest import LONGEST, outcome, settle, settle_on_fem
-from softgym_envs.codesign.benchmark.scoring import DATA
-from softgym_envs.codesign.benchmark.search import Search
 from softgym_envs.config import provenance
 from softgym_envs.errors import DataError, unknown_name
+from softgym_envs.extensions.leaderboard.frozen import FrozenProblem, load_problem
+from softgym_envs.extensions.leaderboard.problem import Judge, Score
+from softgym_envs.extensions.leaderboard.rest import LONGEST, outcome, settle, settle_on_fem
+from softgym_envs.extensions.leaderboard.scoring import DATA
+from softgym_envs.extensions.leaderboard.search import Search
 from softgym_envs.extras import require
 from softgym_envs.storage import atomic_write, read_npz
 from softgym_envs.surrogate.pretrained import ships_weights
@@ -216,7 +216,7 @@ class Tabulation:
 
     Args:
         problem: a problem with the objective ``mean_distance``, on a batched surrogate.
-        longest: largest step towards rest, see `softgym_envs.codesign.benchmark.rest`.
+        longest: largest step towards rest, see `softgym_envs.extensions.leaderboard.rest`.
         goal_set: name of the goals.
         goal_count: how many of them count, from the first on; default all.
 

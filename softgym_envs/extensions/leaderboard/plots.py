@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.agents.statistics import interquartile_mean
-from softgym_envs.codesign.benchmark.frozen import load_problem, problem_names
-from softgym_envs.codesign.benchmark.problem import BenchmarkProblem
-from softgym_envs.codesign.benchmark.regret import EQUAL, Contest, Stored, contests
-from softgym_envs.codesign.benchmark.runs import stored_runs
-from softgym_envs.codesign.benchmark.scoring import DATA, reference
 from softgym_envs.codesign.report.plots import STYLE, draw_silhouette, silhouette
 from softgym_envs.codesign.report.units import present
+from softgym_envs.extensions.leaderboard.frozen import load_problem, problem_names
+from softgym_envs.extensions.leaderboard.problem import BenchmarkProblem
+from softgym_envs.extensions.leaderboard.regret import EQUAL, Contest, Stored, contests
+from softgym_envs.extensions.leaderboard.runs import stored_runs
+from softgym_envs.extensions.leaderboard.scoring import DATA, reference
 
 COLOURS = {
     "random": "#94a3b8",
