@@ -4,7 +4,7 @@
 #   make check    lint, types and fast tests (a minute)
 #   make test     all tests                        make slow-tests    all tests, and update the list of slow ones
 #   make lint     ruff                             make types         mypy
-#   make bench    speed and accuracy               make clean         remove caches and build leftovers
+#   make bench    speed                            make clean         remove caches and build leftovers
 #   make docs     site, in site/                   make docs-images   pictures of the site, in docs/images/
 #   make setup    set-up only                      make lock          renew requirements.lock
 #   make test-clients           the snippets for other libraries, each in an environment of its own

@@ -1,1 +1,1 @@
-"""Benchmarks of speed and accuracy, run by `softgym bench`; their results are kept in results.json."""
+"""Benchmarks of speed, run by `softgym bench`; their results are kept in results.json."""

@@ -7,6 +7,7 @@ and the generated text replaces the line ``<!-- generated -->`` in it, if there 
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 from collections.abc import Iterable, Sequence
@@ -91,6 +92,43 @@ def robot_list() -> str:
     return cards(entries)
 
 
+# -- studies --------------------------------------------------------------------------------------------------------
+
+ROOT = DOCS.parent
+OUTSIDE = ("studies", "benchmarks")
+"""Folders beside the documentation whose pages and pictures are part of the site."""
+
+
+def study_files() -> list[Path]:
+    """Return the pages and pictures of the folders outside, relative to the root, the index of studies first."""
+    files = [path for folder in OUTSIDE for kind in ("md", "png", "svg") for path in (ROOT / folder).rglob(f"*.{kind}")]
+    return sorted(
+        (path.relative_to(ROOT) for path in files), key=lambda path: (path != Path("studies/README.md"), path)
+    )
+
+
+def site_links(markdown: str, uri: str) -> str:
+    """Return a page whose links to and from the folders outside are those of the site.
+
+    On disk pages of the documentation stand in ``docs``, and the folders outside beside it; on the site, all stand
+    under one root.
+
+    Args:
+        markdown: the page.
+        uri: its path on the site.
+    """
+    here = os.path.dirname(uri)
+    outside = uri.startswith(OUTSIDE)
+
+    def replace(match: re.Match[str]) -> str:
+        target = os.path.normpath(os.path.join("" if outside else "docs", here, match[1]))
+        if not outside and not target.startswith(OUTSIDE):
+            return match[0]
+        return f"]({os.path.relpath(target.removeprefix('docs/'), here or '.')}"
+
+    return re.sub(r"\]\(((?:\.\./)+[\w/.-]+)", replace, markdown)
+
+
 # -- events of mkdocs -----------------------------------------------------------------------------------------------
 
 
@@ -102,6 +140,7 @@ def on_config(config: Any) -> Any:
         "Environments": [f"environments/{name}.md" for name in environment_pages()],
         "Robots": [f"robots/{name}.md" for name in ROBOTS],
         "API reference": [f"reference/{package}.md" for package in PACKAGES],
+        "Studies": [str(path) for path in study_files() if path.suffix == ".md" and path.parts[1] != "README.md"],
     }
     _complete(config.nav, generated)
     return config
@@ -125,6 +164,8 @@ def on_files(files: Any, config: Any) -> Any:
         files.append(File.generated(config, f"reference/{package}.md", content=api_page(package)))
     for path, content in notebooks().items():
         files.append(File.generated(config, path, content=content))
+    for path in study_files():
+        files.append(File.generated(config, str(path), abs_src_path=str(ROOT / path)))
     known = {f"environments/{name}.md" for name in (*environment_pages(), "index")}
     for file in list(files):
         if file.src_uri.startswith("environments/") and file.src_uri.endswith(".md") and file.src_uri not in known:
@@ -133,14 +174,19 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Complete a page from the registries."""
+    """Complete a page from the registries, and its links to studies."""
+    return site_links(completed(markdown, page), page.file.src_uri)
+
+
+def completed(markdown: str, page: Any) -> str:
+    """Return a page with what comes from the registries."""
     folder, _, name = page.file.src_uri.removesuffix(".md").rpartition("/")
     if name == "index":
         lists = {"environments": environment_list, "robots": robot_list}
         return markdown.replace(HERE, lists[folder]()) if folder in lists else markdown
     if page.file.src_uri.removesuffix(".md") in PAGES:
         return f"{markdown}\n\n[This page as a notebook]({name}.ipynb){{ download }}\n"
-    if page.file.src_uri in ("benchmark.md", "benchmark_findings.md"):
+    if page.file.src_uri == "benchmark.md":
         return benchmark_page(markdown)
     if page.file.src_uri == "gallery.md":
         return markdown.replace(HERE, gallery())

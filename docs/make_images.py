@@ -8,7 +8,6 @@ needs a finished study (``make demo``) and Chromium, so it is drawn only when it
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import shutil
 import subprocess
@@ -24,13 +23,11 @@ import numpy as np
 from PIL import Image, ImageSequence
 from site_writing import DOCS, environment_pages
 
-from benchmarks import convergence_tables, grown_shapes, structures
 from softgym_envs import make_robot
 from softgym_envs.agents.evaluation import make_agent
 from softgym_envs.backends import make_backend
 from softgym_envs.extensions.leaderboard import plots
 from softgym_envs.mechanics import Statics
-from softgym_envs.mechanics.elements.tetrahedra import boundary_triangles
 from softgym_envs.robots import ROBOTS
 from softgym_envs.robots.modules import MODULES
 from softgym_envs.viewer.image import ImageRenderer
@@ -158,30 +155,6 @@ def draw_modules() -> np.ndarray:
     return np.asarray(image)
 
 
-def draw_structures() -> np.ndarray:
-    """Draw the best arms of the first searches, and the baseline, at rest and with both wires pulled."""
-    import pyvista
-
-    rows = {row["search"]: row for row in reversed(json.loads(structures.KEPT.read_text())["rows"])}
-    plotter = pyvista.Plotter(shape=(1, len(rows)), off_screen=True, window_size=(1200, 640), border=False)
-    for column, (name, row) in enumerate(sorted(rows.items())):
-        model = make_robot("modular_arm", cells=6, body="solid").build(row["design"])
-        solver = Statics(model)
-        pulled = [solver.solve(share * np.array([0.003, 0.006])).x for share in (0.5, 1.0)][-1]
-        triangles = np.concatenate([boundary_triangles(block.corners) for block in model.solids])
-        faces = np.column_stack([np.full(len(triangles), 3), triangles]).ravel()
-        plotter.subplot(0, column)
-        plotter.set_background("white")
-        plotter.add_mesh(pyvista.PolyData(model.nodes, faces), color="#c9d3de", opacity=0.3)
-        plotter.add_mesh(pyvista.PolyData(pulled, faces), color="#10776d")
-        plotter.add_text(name, position="lower_edge", font_size=9, color="black")
-        plotter.view_vector((1.0, -0.5, 0.3), viewup=(0.0, 0.0, 1.0))
-        plotter.camera.zoom(1.2)
-    image = plotter.screenshot(return_img=True)
-    plotter.close()
-    return np.asarray(image)
-
-
 def draw_arm() -> np.ndarray:
     """Return the picture that the tutorial on a robot of your own draws."""
     with tempfile.TemporaryDirectory() as folder:
@@ -206,8 +179,7 @@ def draw_report() -> np.ndarray:
 def main(names: list[str]) -> None:
     """Draw the named pictures, or all but the report."""
     table: dict[str, Callable[[], np.ndarray]] = {"arm": draw_arm, "grasp": draw_grasp}
-    table |= {"convergence": convergence_tables.draw, "modules": draw_modules, "structures": draw_structures}
-    table |= {"grown_shapes": grown_shapes.draw}
+    table |= {"modules": draw_modules}
     table |= {"benchmark_regret": plots.draw_regret, "benchmark_winners": plots.draw_winners}
     table |= {name: partial(draw_robot, name) for name in ROBOTS}
     films = [f"{name}.webp" for name in environment_pages()]

@@ -74,7 +74,7 @@ def imports_of(path):
         else:
             continue
         for name in names:
-            if name.split(".")[0] in ("softgym_envs", "benchmarks"):
+            if name.split(".")[0] in ("softgym_envs", "benchmarks", "studies"):
                 yield name, id(node) in lazy, node.lineno
 
 

@@ -148,7 +148,7 @@ def test_the_checker_sees_private_paths():
     ```python
     from softgym_envs.errors import WeightsError, unknown_name
     def f():
-        import benchmarks.run
+        import benchmarks.speed
     ```
     """
     text = re.sub("^    ", "", page, flags=re.MULTILINE)
@@ -156,6 +156,6 @@ def test_the_checker_sees_private_paths():
         "softgym_envs.designs",
         "softgym_envs.robots.make_robot",
         "softgym_envs.errors.unknown_name",
-        "benchmarks.run",
+        "benchmarks.speed",
         "softgym_envs.codesign.tools.Absent",
     ]

@@ -1,19 +1,26 @@
 """The README and the documentation: files they name exist, and their numbers are those of the recorded results."""
 
+import importlib.util
 import re
 from pathlib import Path
 
 import pytest
 
-from benchmarks import page as bench
-from benchmarks import recorded as results
 from softgym_envs.errors import DataError
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+SPEC = importlib.util.spec_from_file_location("docs_figures", ROOT / "docs" / "figures.py")
+figures = importlib.util.module_from_spec(SPEC)
+SPEC.loader.exec_module(figures)
+GUIDES = figures.pages()
+STUDIES = sorted((ROOT / "studies").rglob("*.md"))
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def name_of(page):
+    return str(page.relative_to(ROOT))
+
+
+@pytest.mark.parametrize("page", [*GUIDES, *STUDIES], ids=name_of)
 def test_links_exist_and_nothing_is_left_to_fill_in(page):
     text = page.read_text()
     assert not re.search(r"@[A-Z]{3,}@|TODO|TBD", text)
@@ -32,27 +39,34 @@ def test_the_readme_is_a_landing_page():
         assert all(len(cell) <= 200 for cell in line.split("|")), "a paragraph in a cell"
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+@pytest.mark.parametrize("page", GUIDES, ids=name_of)
 def test_numbers_are_those_of_the_results(page):
-    """`python -m benchmarks.page` would change nothing."""
+    """`python docs/figures.py` would change nothing."""
     text = page.read_text()
-    assert bench.fill(text) == text, f"run python -m benchmarks.page ({page.name})"
+    assert figures.fill(text) == text, f"run python docs/figures.py ({page.name})"
     # A comment at the start of a line begins a block of raw HTML, which would split a paragraph.
-    assert not re.search(r"^ *<!-- bench: [^\n]+? :: ", text, flags=re.MULTILINE)
+    assert not re.search(r"^ *<!-- figure: [^\n]+? :: ", text, flags=re.MULTILINE)
     assert (
-        len(re.findall("<!-- bench: ", text))
-        == len(re.findall("<!-- /bench -->", text))
-        == len(bench.MARKER.findall(text))
+        len(re.findall("<!-- figure: ", text))
+        == len(re.findall("<!-- /figure -->", text))
+        == len(figures.MARKER.findall(text))
     )
+
+
+@pytest.mark.parametrize("study", [path.parent for path in STUDIES if path.parent.name != "studies"], ids=name_of)
+def test_a_study_says_what_it_is(study):
+    """A question, the commit at which it is frozen, and the command that makes its results."""
+    text = (study / "README.md").read_text()
+    assert text.startswith("# ") and "<!-- figure: " not in text
+    for heading in ("Question", "Answer", "Frozen at"):
+        assert f"\n**{heading}" in text, heading
+    assert f"({study.name}/README.md)" in (ROOT / "studies" / "README.md").read_text(), "not in studies/README.md"
 
 
 @pytest.fixture
 def recorded(monkeypatch):
     entry = {"results": {"a: error [mm]": 0.00018, "b: error [mm]": 2.5, "pair": [1.0, 2.0], "text": "3 of 4"}}
-    monkeypatch.setattr(results, "records", lambda: {"speed": entry})
-    results.results.cache_clear()
-    yield
-    results.results.cache_clear()
+    monkeypatch.setattr(figures, "records", lambda: {"speed": entry})
 
 
 @pytest.mark.parametrize(
@@ -67,8 +81,8 @@ def recorded(monkeypatch):
     ],
 )
 def test_a_marker_is_filled_with_its_result(recorded, marker, text):
-    page = f"before <!-- bench: {marker} -->stale<!-- /bench --> after"
-    assert bench.fill(page) == f"before <!-- bench: {marker} -->{text}<!-- /bench --> after"
+    page = f"before <!-- figure: {marker} -->stale<!-- /figure --> after"
+    assert figures.fill(page) == f"before <!-- figure: {marker} -->{text}<!-- /figure --> after"
 
 
 @pytest.mark.parametrize(
@@ -76,10 +90,10 @@ def test_a_marker_is_filled_with_its_result(recorded, marker, text):
     [
         ("speed :: c", "0 results named 'c'"),
         ("speed :: *: error [mm] :: .1f", r"2 results named '\*: error \[mm\]'"),
-        ("spede :: a", "no results of benchmark 'spede'; recorded: speed"),
-        ("headline", "no table 'headline'; allowed: headlines"),
+        ("spede :: a", "no record 'spede'; allowed: speed"),
+        ("headline", "'headline' is no table; allowed: headlines"),
     ],
 )
 def test_a_wrong_marker_is_refused(recorded, marker, message):
     with pytest.raises(DataError, match=message):
-        bench.fill(f"<!-- bench: {marker} --><!-- /bench -->")
+        figures.fill(f"<!-- figure: {marker} --><!-- /figure -->")

@@ -16,11 +16,9 @@ from softgym_envs.errors import ConfigError
 )
 @click.argument("names", nargs=-1)
 def bench(output: Path, names: tuple[str, ...]) -> None:
-    """Measure speed and accuracy.
+    """Measure speed.
 
-    Runs the benchmarks NAMES, or all of them if no name is given, which takes hours. Needs a source checkout.
-
-    Those of the convergence of grippers, also part of "convergence", take up to an hour and 8 GB each.
+    Runs the benchmarks NAMES, or all of them if no name is given, which takes half an hour. Needs a source checkout.
     """
     try:
         from benchmarks.run import run

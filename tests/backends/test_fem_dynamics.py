@@ -11,12 +11,12 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import softgym_envs  # noqa: F401  (registers the environments)
-from benchmarks import robot_dynamics as cases
 from softgym_envs import make_robot
 from softgym_envs.backends.backend import PointForce
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.surrogate.domain import FOLDED
+from tests.verification import robot_dynamics as cases
 
 SMALL = {"SoftGym/FingerReach-v0": {}, "SoftGym/DiamondReach-v0": {"mesh_size": 30e-3}}
 

@@ -13,8 +13,6 @@ import optuna
 import pytest
 import sqlalchemy as sql
 
-from benchmarks.codesign_scale import Sweep, faults
-from benchmarks.postgres_server import find_programs, temporary_server
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.folder import StudyFolder
 from softgym_envs.codesign.records import Account, Job, TrialResult
@@ -25,6 +23,8 @@ from softgym_envs.codesign.scheduling.queue import TrialQueue
 from softgym_envs.codesign.study import run_study
 from softgym_envs.errors import ConfigError, DataError, SoftGymError
 from softgym_envs.testing import wait_until
+from tests.codesign.kills import Sweep, faults
+from tests.codesign.postgres_server import find_programs, temporary_server
 
 GRACE = 2.0
 

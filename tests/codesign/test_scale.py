@@ -13,7 +13,6 @@ import optuna
 import pytest
 from optuna.trial import TrialState
 
-from benchmarks.codesign_scale import Sweep, faults
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.folder import StudyFolder
 from softgym_envs.codesign.phases.trial import give_up
@@ -27,6 +26,7 @@ from softgym_envs.codesign.snapshot import load_study
 from softgym_envs.codesign.study import run_study
 from softgym_envs.errors import ConfigError, DataError, MeshingError, SoftGymError
 from softgym_envs.testing import wait_until
+from tests.codesign.kills import Sweep, faults
 
 SMALL = {"count": 2, "unseen_count": 2, "training_count": 2}
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.contact_control import distance_without_wall, force_goal, reach_along_wall
 from softgym_envs import make_robot
 from softgym_envs.backends.backend import Backend, State
 from softgym_envs.backends.fem import FEMBackend
@@ -15,6 +14,7 @@ from softgym_envs.control import ContactControl, ContactQP, ForceGoal
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.contact.obstacles import Plane
+from tests.verification.contact_control import distance_without_wall, force_goal, reach_along_wall
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.5])

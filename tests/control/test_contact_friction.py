@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.contact_friction import carry, random_friction_problem, random_problems
 from softgym_envs.control import ContactQP
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import ContactModel
+from tests.verification.contact_friction import carry, random_friction_problem, random_problems
 
 MM = 1e-3
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.contact_control import random_problem, random_problems
 from softgym_envs.control import ContactQP, ForceGoal, InverseQP
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel, Row
+from tests.verification.contact_control import random_problem, random_problems
 
 MM = 1e-3
 

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks.contact_control import enumerated_optimum
 from softgym_envs.control.qpcc import ComplementarityQP, solve_qpcc
 from softgym_envs.errors import ConvergenceError
+from tests.verification.contact_control import enumerated_optimum
 
 
 def random_problem(seed, contacts, actuators=2):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks import dynamics as cases
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
@@ -13,6 +12,7 @@ from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.constraints.servo import Servo
 from softgym_envs.mechanics.elements.rigid import sphere_inertia
 from softgym_envs.mechanics.solvers.dynamics import SCHEMES, Dynamics
+from tests.verification import dynamics as cases
 
 
 def by_case(rows):
@@ -427,17 +427,14 @@ def test_an_impossible_start_is_reported():
     assert solver.linearisation.inertia is None
 
 
-def test_every_case_is_in_the_benchmark():
-    from benchmarks.run import BENCHMARKS
-
-    assert BENCHMARKS["dynamics"] is cases.dynamics
+def test_every_case_is_tested():
     assert set(cases.CASES) == {
         "conservation", "order", "frequencies", "history", "rigid", "compliance", "book_keeping", "quasi_static",
         "workspace", "hanging", "random_designs", "robustness",
     }  # fmt: skip
 
 
-def test_the_benchmark_prints_a_table_and_returns_json_data(monkeypatch, capsys):
+def test_dynamics_prints_a_table_and_returns_json_data(monkeypatch, capsys):
     import json
 
     rows = [cases.Row("case", "one", 1.0), cases.Row("case", "two", 1.0, 2.0, -0.5, 1.99)]

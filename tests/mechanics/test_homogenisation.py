@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks import printed
 from softgym_envs.mechanics.homogenisation import Cell, homogenise, lattice
 from softgym_envs.mechanics.materials import lame_parameters
+from tests.verification import infill
 
 
 def test_a_solid_cell_is_its_material():
@@ -48,9 +48,9 @@ def test_a_lattice_along_its_walls_and_between_its_bounds():
 
 
 def test_a_bar_of_many_cells_approaches_the_homogeneous_one(monkeypatch):
-    monkeypatch.setattr(printed, "CELLS", (1, 3))
-    monkeypatch.setattr(printed, "WALLS", {"walls": (0.3, 0.3)})
-    found = printed.printed()
+    monkeypatch.setattr(infill, "CELLS", (1, 3))
+    monkeypatch.setattr(infill, "WALLS", {"walls": (0.3, 0.3)})
+    found = infill.compliances()
     for load, limit in (("tension", 0.01), ("shear", 0.10), ("bending", 0.15)):
         few, many = (abs(found[f"walls: {count} cells: {load}, compliance over resolved"] - 1.0) for count in (1, 3))
         assert many < limit and many < 0.5 * few

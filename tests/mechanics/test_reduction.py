@@ -7,14 +7,14 @@ import pytest
 from scipy.linalg import eigh, null_space
 from scipy.sparse import csc_matrix
 
-from benchmarks import dynamics as cases
 from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.solvers.reduction import reduce_motion
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.soft_finger import SoftFinger
+from tests.verification import dynamics as cases
 
 LENGTH, RADIUS, YOUNG, DENSITY, BETA = 1.0, 0.005, 1e7, 1000.0, 0.02
-"""The rod of `benchmarks.dynamics` and the damping of the tests [m, m, Pa, kg/m3, s]."""
+"""The rod of `tests.verification.dynamics` and the damping of the tests [m, m, Pa, kg/m3, s]."""
 
 
 @pytest.fixture(scope="module")

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks import dynamics as cases
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.elements.rigid import RigidBody, box_inertia, sphere_inertia
 from softgym_envs.mechanics.frames import rotation_of
 from softgym_envs.mechanics.solvers.dynamics import Dynamics
+from tests.verification import dynamics as cases
 
 
 def by_case(rows):

@@ -4,7 +4,6 @@ import gymnasium
 import numpy as np
 import pytest
 
-from benchmarks.modular import ExactArm
 from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.errors import DesignError, InfeasibleDesign
@@ -12,6 +11,7 @@ from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.geometry.export import export_body
 from softgym_envs.robots.modular_arm import BODIES, CELLS
 from softgym_envs.surrogate.domain import doubt_text
+from tests.verification.modular_arm import ExactArm
 
 
 @pytest.mark.parametrize(

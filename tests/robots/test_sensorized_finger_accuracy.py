@@ -8,8 +8,30 @@ from functools import cache
 import numpy as np
 import pytest
 
-from benchmarks.sensor_finger import DESIGNS
 from softgym_envs import make_robot
+
+MM = 1e-3
+DESIGNS: dict[str, dict[str, float]] = {
+    "slim": {
+        "slope": 0.878,
+        "outer_radius": 9.10 * MM,
+        "joint_height": 5.10 * MM,
+        "cork_thickness": 2.14 * MM,
+        "bellow_height": 9.60 * MM,
+        "wall_thickness": 2.45 * MM,
+        "plateau_height": 3.84 * MM,
+    },
+    "large": {
+        "slope": 0.592,
+        "outer_radius": 17.52 * MM,
+        "joint_height": 6.45 * MM,
+        "cork_thickness": 2.05 * MM,
+        "bellow_height": 13.0 * MM,
+        "wall_thickness": 3.0 * MM,
+        "plateau_height": 3.86 * MM,
+    },
+}
+"""The two fingers that were built (thesis, fig. 3.3)."""
 
 
 @cache

@@ -7,7 +7,6 @@ import itertools
 import numpy as np
 import pytest
 
-from benchmarks.robots import PUBLISHED_COMPLIANCE
 from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.backends.fem_batch import FEMBatch
@@ -16,6 +15,22 @@ from softgym_envs.control import InverseQP
 from softgym_envs.errors import DesignError, WeightsError
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.stiff_flop import StiffFlop
+
+PUBLISHED_COMPLIANCE = {
+    "W_aa base, same pair": 0.3057,
+    "W_aa base, two pairs": 0.0640,
+    "W_aa tip, same pair": 0.5293,
+    "W_aa tip, two pairs": 0.1028,
+    "W_xa base": 0.0429,
+    "W_xa tip": 0.0734,
+    "W_ya base": 1.0065,
+    "W_ya tip": 0.7085,
+    "W_za base": 1.162,
+    "W_za tip": 0.818,
+    "W_xx": 0.0393,
+    "W_yy": 11.59,
+}
+"""Rest compliance of the Stiff-Flop in the authors' public data (the thesis has none), in mm3, mm, kPa and mN."""
 
 UL = 1e-9  # a microlitre, mm3 [m3]
 ACTUATED = UL * np.array([18.0, 4.0, 9.0, 6.0, 15.0, 2.0])

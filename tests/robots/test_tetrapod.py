@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks import robot_dynamics as cases
 from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.errors import ConvergenceError, DesignError
@@ -16,6 +15,7 @@ from softgym_envs.mechanics.elements.beams import Beam
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.tetrapod import CENTRE_MASS, MESHES
 from softgym_envs.surrogate.domain import doubt_text
+from tests.verification import robot_dynamics as cases
 
 
 @pytest.fixture(scope="module")

@@ -23,8 +23,9 @@ def _stiffness(wall_x: float, wall_y: float, poisson_ratio: float) -> np.ndarray
 class PrintedBlock(SolidBlock):
     """A block printed along z with crossing walls inside, and no skin around them.
 
-    The lattice is not resolved: it must be several times finer than the block (`softgym bench printed` shows what that
-    costs), and strains must be so small that no wall buckles. What a printer makes of it must be measured.
+    The lattice is not resolved: it must be several times finer than the block (`python -m tests.verification infill`
+    shows what that costs), and strains must be so small that no wall buckles. What a printer makes of it must be
+    measured.
     """
 
     name = "printed_block"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.contact import block_on_incline
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.contact.contact import ContactSettings, ContactState
@@ -15,6 +14,7 @@ from softgym_envs.mechanics.solvers.dynamics import Dynamics
 from softgym_envs.mechanics.solvers.prediction import Bend
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.testing import box_mesh, contact_errors
+from tests.verification.contact import block_on_incline
 
 GRAVITY = 9.81
 

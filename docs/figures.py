@@ -1,0 +1,157 @@
+"""``python docs/figures.py``: write recorded results into the README and the guides, so that no number is typed twice.
+
+A marked place in a Markdown file is rewritten::
+
+    <!-- figure: headlines -->the table of the README<!-- /figure -->
+    <!-- figure: shared_finger :: cube, mean [mm] :: .2f -->0.23<!-- /figure -->
+
+The second form names a record, one of its results, and how to write it:
+
+* a result inside a group is named ``group: name``;
+* a result may be a pattern with ``*``; then ``min`` or ``max`` in front of the format says which match to take;
+* ``[1]`` in front of the format takes an item of a list;
+* an empty format writes the value as it stands.
+
+Records stand in ``studies/*/results.json`` and, for speed, in ``benchmarks/results.json``. A test compares all pages
+with them. Pages of studies are frozen and have no marked places.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import sys
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from softgym_envs.errors import DataError
+from softgym_envs.wording import decimal
+
+ROOT = Path(__file__).resolve().parents[1]
+MARKER = re.compile(r"(<!-- figure: (?P<key>.+?) -->)(?P<text>.*?)(<!-- /figure -->)", re.DOTALL)
+FORMAT = re.compile(r"(?P<pick>min|max)? *(?:\[(?P<item>\d+)\])? *(?P<form>.*)")
+HEADLINES = ("finger_reach", "diamond_reach", "trunk_reach", "cable_trunk_reach", "tetrapod_reach")
+
+
+def pages() -> list[Path]:
+    """Return the pages with marked places: the README and the guides."""
+    return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+@cache
+def records() -> dict[str, dict[str, Any]]:
+    """Return every record by its name: its results, and the commit and command that made them.
+
+    Raises:
+        DataError: if two files hold a record of the same name.
+    """
+    found: dict[str, dict[str, Any]] = {}
+    for path in (ROOT / "benchmarks" / "results.json", *sorted((ROOT / "studies").glob("*/results.json"))):
+        entries = json.loads(path.read_text())
+        if twice := found.keys() & entries.keys():
+            raise DataError(f"'{path.relative_to(ROOT)}' repeats the records {', '.join(sorted(twice))}")
+        found |= entries
+    return found
+
+
+def number(value: Any, form: str) -> str:
+    """Format a value; exponents are written without leading zeros: ``1.8e-4``."""
+    if not form:
+        return str(value)
+    text = "infinite" if value == float("inf") else format(value, form)
+    return re.sub(r"e([+-])0*(\d)", lambda m: f"e{m[1].strip('+')}{m[2]}", text)
+
+
+def _named(values: dict[str, Any], group: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield results and groups of results by name, those inside a group as ``"group: name"``."""
+    for name, value in values.items():
+        yield group + name, value
+        if isinstance(value, dict):
+            yield from _named(value, f"{group}{name}: ")
+
+
+def figure(record: str, name: str, form: str = "") -> str:
+    """Return one result as text.
+
+    Args:
+        record: its name.
+        name: of the result, or a pattern with ``*``; ``"group: name"`` for one in a group of results.
+        form: see the head of this file.
+
+    Raises:
+        DataError: if there is no such record, or if no result, or more than one, has this name.
+    """
+    if record not in records():
+        raise DataError(f"no record '{record}'; allowed: {', '.join(sorted(records()))}")
+    named = dict(_named(records()[record]["results"]))
+    how = FORMAT.fullmatch(form.strip())
+    assert how is not None
+    pattern = re.compile(re.escape(name).replace(r"\*", ".*"))
+    values = [named[name]] if name in named else [value for key, value in named.items() if pattern.fullmatch(key)]
+    if how["item"]:
+        values = [value[int(how["item"])] for value in values]
+    if not values or (len(values) > 1 and not how["pick"]):
+        raise DataError(f"record '{record}' has {len(values)} results named '{name}', not one")
+    return number({"min": min, "max": max}.get(how["pick"], min)(values), how["form"])
+
+
+def headlines() -> str:
+    """Studies: mean distance to the test goals on FEM, from the baseline to the winner, and on a finer mesh."""
+    lines = [
+        "| robot; controller | baseline | winner | change, 95% | study's → finer mesh | command |",
+        "| --- | --: | --: | --: | --: | --- |",
+    ]
+    for key in HEADLINES:
+        study = records()["codesign"]["results"][key]
+        row = study["rows"][0]
+        finer = next((r for r in study.get("meshes", ()) if r["judge"] == "finite elements, finer mesh"), None)
+        # No-break spaces keep numbers and units together.
+        ends = [decimal(row[f"{who} [mm]"], 2) for who in ("baseline", "winner")]
+        low, high = row.get("change with the mesh, 95% interval [mm]") or row["change, 95% interval [mm]"]
+        checked = ""
+        if finer is not None:
+            checked = "\u00a0→\u00a0".join(decimal(finer[f"change{when} [mm]"], 2) for when in (" before", ""))
+            checked += "\u00a0mm"
+        cells = [
+            f"{study['title']}; {row['controller'].partition(',')[0]}",
+            f"{ends[0]}\u00a0mm",
+            f"→\u00a0{ends[1]}\u00a0mm",
+            f"{low:.1f}\u00a0to\u00a0{high:.1f}\u00a0mm",
+            checked,
+            f"`{study['command']}`",
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def fill(text: str) -> str:
+    """Return a Markdown page with every marked place rewritten from the records."""
+
+    def replace(match: re.Match[str]) -> str:
+        name, *rest = (part.strip() for part in match["key"].split("::"))
+        if rest:
+            content = figure(name, *rest)
+        elif name == "headlines":
+            content = f"\n\n{headlines()}\n\n"
+        else:
+            raise DataError(f"'{name}' is no table; allowed: headlines")
+        return f"{match[1]}{content}{match[4]}"
+
+    return MARKER.sub(replace, text)
+
+
+def main() -> None:
+    """Rewrite the pages and name those that changed."""
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
+    for path in pages():
+        text = path.read_text()
+        if (filled := fill(text)) != text:
+            path.write_text(filled)
+            sys.stdout.write(f"{path.relative_to(ROOT)}\n")
+
+
+if __name__ == "__main__":
+    main()
