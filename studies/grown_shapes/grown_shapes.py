@@ -435,7 +435,7 @@ def search(
 
 def volume(rows: list[dict[str, Any]], baseline: Judged) -> float:
     """Return the hypervolume of bodies: costs relative to the baseline's, up to twice its costs."""
-    from softgym_envs.extensions.leaderboard.scoring import WORST, hypervolume
+    from softgym_envs.codesign.benchmark.scoring import WORST, hypervolume
 
     solved = [Judged(row["reach"], row["stiffness"], row["effort"]) for row in rows if "failed" not in row]
     costs = np.array([body.costs(baseline) for body in solved]).reshape(-1, 2)
