@@ -1,6 +1,6 @@
 """Train and evaluate many configurations with several seeds, one process each.
 
-    python -m softgym_envs.agents.sweep --configs configs/agents/*.yaml --seeds 0 1 2 --processes 16 --folder results
+    python -m softgym_envs.agents.sweep --configs finger_reach mine.yaml --seeds 0 1 2 --processes 16 --folder results
 
 Trainings go to ``FOLDER/runs/<config>/seed<k>``. Results, which `softgym_envs.agents.results` reads, go to
 ``FOLDER/results/<config>``: ``seed<k>.json`` for each policy and ``baselines.json`` for the agents that need no
@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softgym_envs.agents.config import EnvironmentConfig, TrainConfig
-from softgym_envs.config import check_config, difference, load_config, provenance
+from softgym_envs.config import check_config, difference, load_config, provenance, shipped_configs
 from softgym_envs.errors import ConfigError, DataError, SoftGymError
 from softgym_envs.executors import parallel_map
 from softgym_envs.storage import read_json, write_json
@@ -262,7 +262,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m softgym_envs.agents.sweep", description=(__doc__ or "").split("\n")[0]
     )
-    parser.add_argument("--configs", type=Path, nargs="+", required=True)
+    parser.add_argument("--configs", nargs="+", help="names of shipped configurations, or files (default: all shipped)")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     parser.add_argument("--folder", type=Path, required=True)
@@ -274,6 +274,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="number of unseen goals on FEM; 0 skips FEM for environments on the surrogate",
     )
     given = parser.parse_args(arguments)
+    shipped = shipped_configs("agents")
     # Worker processes read these variables when they start.
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[variable] = "1"
@@ -281,7 +282,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.environ.setdefault("SOFTGYM_CACHE", str(given.folder / "cache"))
     try:
         failed = sweep(
-            given.configs, given.seeds, given.processes, given.folder, goals=given.goals, fem_goals=given.fem_goals
+            [shipped.get(name, Path(name)) for name in given.configs or shipped],
+            given.seeds,
+            given.processes,
+            given.folder,
+            goals=given.goals,
+            fem_goals=given.fem_goals,
         )
     except SoftGymError as error:
         parser.error(str(error))

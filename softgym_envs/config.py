@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import hashlib
 import os
@@ -68,6 +69,12 @@ def read_value(text: str) -> Any:
     return yaml.load(text, Loader=_Loader)
 
 
+CONFIGS = Path(__file__).parent / "configs"
+"""Folder of the shipped configurations."""
+
+ENTRIES = "configurations"
+"""Key of a file with several configurations, by name; the key ``defaults`` beside it holds what they share."""
+
 _PASSWORD = re.compile(r"(?<=[^/]):[^/@:\s]*@")
 """The password in a database address, which must not appear in a message or log."""
 
@@ -83,6 +90,9 @@ ModelT = TypeVar("ModelT", bound=Config)
 def load_config(path: str | Path | None, model: type[ModelT], overrides: Sequence[str] = ()) -> ModelT:
     """Return the configuration in a YAML file, with overrides.
 
+    ``FILE/NAME`` is one of several configurations in a file: an entry of its ``configurations`` holds what differs from
+    its ``defaults``, or from the entry named by the key ``like``.
+
     Paths in the file are relative to the file, or to the working directory where nothing is found beside the file;
     paths in overrides are relative to the working directory.
 
@@ -97,20 +107,18 @@ def load_config(path: str | Path | None, model: type[ModelT], overrides: Sequenc
     data: Any = {}
     if path is not None:
         path = Path(path)
-        try:
-            data = read_value(path.read_text())
-        except OSError as error:
-            inside = path / "config.yaml"
-            reason = f"it is a folder; its file is {inside}" if inside.exists() else error.strerror or error
-            raise ConfigError(f"config '{path}' cannot be read: {reason}") from None
-        except (yaml.YAMLError, UnicodeDecodeError) as error:
-            where = getattr(error, "problem_mark", None)
-            place = f", line {where.line + 1}" if where is not None else ""
-            raise ConfigError(f"config '{path}' is not valid YAML{place}: {getattr(error, 'problem', error)}") from None
-        data = {} if data is None else data
-        if not isinstance(data, dict):
-            raise ConfigError(f"config '{path}' must be a mapping of keys to values, got a {type(data).__name__}")
-        _find_files(model, data, path.parent)
+        file, name = (path.parent, path.name) if path.parent.is_file() else (path, None)
+        data = _read_file(file)
+        if several := data.get(ENTRIES):
+            allowed = ", ".join(several)
+            if name is None:
+                raise ConfigError(f"config '{path}' holds several: add the name of one; allowed: {allowed}")
+            if name not in several:
+                raise ConfigError(f"config '{file}': {unknown_name('configuration', name, several)}")
+            data = _entry(file, data, name)
+        elif name is not None:
+            raise ConfigError(f"config '{path}' cannot be read: '{file}' holds one configuration, without a name")
+        _find_files(model, data, file.parent)
     for override in overrides:
         key, separator, text = override.partition("=")
         if not separator or not key:
@@ -126,6 +134,65 @@ def load_config(path: str | Path | None, model: type[ModelT], overrides: Sequenc
         except yaml.YAMLError:
             raise ConfigError(f"override '{override}': the value is not valid YAML") from None
     return check_config(model, data, f"config '{path}'" if path is not None else "config")
+
+
+def _read_file(path: Path) -> dict[str, Any]:
+    """Return the keys and values of a YAML file; ConfigError if it cannot be read or holds something else."""
+    try:
+        data = read_value(path.read_text())
+    except OSError as error:
+        inside = path / "config.yaml"
+        reason = f"it is a folder; its file is {inside}" if inside.exists() else error.strerror or error
+        raise ConfigError(f"config '{path}' cannot be read: {reason}") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        where = getattr(error, "problem_mark", None)
+        place = f", line {where.line + 1}" if where is not None else ""
+        raise ConfigError(f"config '{path}' is not valid YAML{place}: {getattr(error, 'problem', error)}") from None
+    data = {} if data is None else data
+    if not isinstance(data, dict):
+        raise ConfigError(f"config '{path}' must be a mapping of keys to values, got a {type(data).__name__}")
+    return data
+
+
+def _entry(file: Path, data: dict[str, Any], name: str) -> dict[str, Any]:
+    """Return one of several configurations of a file: its defaults, or the entry that it is like, with its own keys."""
+    entries = list(data[ENTRIES])
+    own = dict(data[ENTRIES][name] or {})
+    like = own.pop("like", None)
+    if like is None:
+        return _merged(data.get("defaults") or {}, own)
+    before = entries[: entries.index(name)]
+    if like not in before:
+        message = unknown_name("configuration", like, before)
+        raise ConfigError(f"config '{file / name}' is like none of those above it: {message}")
+    return _merged(_entry(file, data, like), own)
+
+
+def _merged(base: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
+    """Return ``base`` with the values of ``own``; groups of keys are merged, everything else is replaced."""
+    pairs = {key: _merged(base[key], value) for key, value in own.items() if isinstance(value, dict) and key in base}
+    return copy.deepcopy({**base, **own, **pairs})
+
+
+@functools.cache
+def shipped_configs(kind: str) -> dict[str, Path]:
+    """Return the shipped configurations of one kind by name, each as the path that `load_config` takes.
+
+    Args:
+        kind: ``"agents"``, ``"codesign"``, ``"design"`` or ``"surrogate"``.
+    """
+    found: dict[str, Path] = {}
+    for file in (CONFIGS / kind).glob("*.yaml"):
+        several = _read_file(file).get(ENTRIES)
+        found |= {file.stem: file} if several is None else {name: file / name for name in several}
+    return dict(sorted(found.items()))
+
+
+def config_text(path: Path) -> str:
+    """Return a configuration of `shipped_configs` as the text of a file of its own."""
+    if path.is_file():
+        return path.read_text()
+    return yaml.safe_dump(_entry(path.parent, _read_file(path.parent), path.name), sort_keys=False)
 
 
 def load_stored(folder: str | Path, model: type[ModelT], kind: str) -> ModelT:

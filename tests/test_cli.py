@@ -47,7 +47,7 @@ def test_rollout_evaluate_and_record(softgym, tmp_path):
     assert out.endswith(f"open it with 'softgym view {recording}'\n")
     status, _, error = softgym("rollout", "SoftGym/FingerTrack-v0", "--record", recording.with_suffix(".mp4"))
     assert status == 2 and "episode.mp4' must end with .rrd" in error
-    config = ROOT / "configs" / "agents" / "finger_reach.yaml"
+    config = "finger_reach"
     output = tmp_path / "table.json"
     status, out, _ = softgym("evaluate", "--config", config, "--goals", 4, "--output", output)
     assert status == 0
@@ -106,7 +106,7 @@ def test_dataset_fit_and_train(softgym, tmp_path):
     tiny = ["workers=1", "network.steps=3", "network.width=16", "robot_options.cables=1"]
     tiny += [f"data.{s}.groups=2" for s in ("train", "validation", "test")]
     tiny += [f"data.{s}.states=3" for s in ("train", "validation", "test")]
-    config = ROOT / "configs" / "surrogate" / "finger_1cable.yaml"
+    config = "finger_1cable"
     data = tmp_path / "data"
     status, out, err = softgym("dataset", "--config", config, "--folder", data, "--quiet", *tiny)
     assert status == 0, err
@@ -117,7 +117,7 @@ def test_dataset_fit_and_train(softgym, tmp_path):
     assert status == 0, err
     assert json.loads(out)["effector_mean"] > 0.0 and (fitted / "model.safetensors").exists()
     assert "errors of the effector are in metres, all others are shares (1 is 100%)" in err
-    config = ROOT / "configs" / "agents" / "finger_reach.yaml"
+    config = "finger_reach"
     small = [
         "steps=64",
         "num_envs=8",
@@ -132,7 +132,7 @@ def test_dataset_fit_and_train(softgym, tmp_path):
     assert (tmp_path / "sac" / "policy.safetensors").exists()
 
 
-CONFIG = "configs/agents/finger_reach.yaml"
+CONFIG = "finger_reach"
 FRONT = "configs/design/sensorized_finger_front.yaml"
 STRENGTH = "configs/design/finger_strength.yaml"
 

@@ -9,7 +9,8 @@ import yaml
 from softgym_envs.agents.config import TrainConfig
 from softgym_envs.cli import options
 from softgym_envs.codesign.tools.config import CalibrationConfig
-from softgym_envs.config import load_config
+from softgym_envs.config import load_config, shipped_configs
+from softgym_envs.errors import ConfigError
 
 ROOT = Path(__file__).resolve().parent.parent
 CALIBRATION = ROOT / "configs" / "design" / "finger_calibration.yaml"
@@ -20,7 +21,8 @@ def test_every_configuration_is_listed_under_its_verbs(softgym):
     assert status == 0
     assert set(options.VERBS) == {path.name for path in (ROOT / "configs").iterdir()}
     listed = {line.strip() for line in out.splitlines()}
-    assert {path.stem for path in (ROOT / "configs").glob("*/*.yaml")} < listed
+    assert {name for kind in options.VERBS for name in shipped_configs(kind)} < listed
+    assert {"finger_reach", "finger_reach_ppo", "finger_2cables_accurate"} < listed
 
 
 def test_a_name_selects_the_kind_of_the_verb(softgym, monkeypatch):
@@ -29,8 +31,7 @@ def test_a_name_selects_the_kind_of_the_verb(softgym, monkeypatch):
     for verb in ("train", "codesign"):
         with pytest.raises(ZeroDivisionError):
             softgym(verb, "--config", "finger_reach", "--folder", "x")
-    assert [path.parent.name for path in seen] == ["agents", "codesign"]
-    assert all(path.samefile(ROOT / "configs" / path.parent.name / "finger_reach.yaml") for path in seen)
+    assert seen == [shipped_configs(kind)["finger_reach"] for kind in ("agents", "codesign")]
 
 
 def test_copies_can_be_edited_and_used(softgym, tmp_path):
@@ -38,6 +39,12 @@ def test_copies_can_be_edited_and_used(softgym, tmp_path):
     assert status == 0 and "mine" in out
     config = load_config(tmp_path / "mine" / "design" / "finger_calibration.yaml", CalibrationConfig)
     assert Path(config.data) == tmp_path / "mine" / "design" / "finger_measured.csv"
+    for kind in ("agents", "surrogate"):
+        for name, path in shipped_configs(kind).items():
+            copied = yaml.safe_load((tmp_path / "mine" / kind / f"{name}.yaml").read_text())
+            assert "like" not in copied and (path.is_file() or "configurations" not in copied)
+    one = load_config(tmp_path / "mine" / "agents" / "finger_reach_ppo.yaml", TrainConfig)
+    assert one == load_config(shipped_configs("agents")["finger_reach_ppo"], TrainConfig)
     status, _, err = softgym("configs", "--copy", tmp_path / "mine")
     assert status == 2 and "exists" in err
 
@@ -55,6 +62,37 @@ def test_paths_in_a_file_are_relative_to_it_and_in_overrides_to_the_working_dire
     assert load_config(config, CalibrationConfig, ["data=finger_measured.csv"]).data == "finger_measured.csv"
     (folder / "finger_measured.csv").unlink()  # then the path is relative to the working directory
     assert load_config(config, CalibrationConfig).data == "finger_measured.csv"
+
+
+SEVERAL = """
+defaults: {environment: {id: SoftGym/FingerReach-v0}, sac: {gamma: 0.9, net_arch: [8]}, steps: 2000}
+configurations:
+  plain: {}
+  wide: {sac: {net_arch: [64]}}
+  longer: {like: wide, steps: 4000}
+  wrong: {like: octopus}
+  later: {like: last}
+  last: {}
+"""
+
+
+def test_entries_of_a_file_hold_what_differs(tmp_path):
+    path = tmp_path / "several.yaml"
+    path.write_text(SEVERAL)
+    plain, wide, longer = (load_config(path / name, TrainConfig) for name in ("plain", "wide", "longer"))
+    assert (plain.sac.gamma, plain.sac.net_arch, plain.steps) == (0.9, [8], 2000)
+    assert (wide.sac.gamma, wide.sac.net_arch, wide.steps) == (0.9, [64], 2000)
+    assert (longer.sac.net_arch, longer.steps) == ([64], 4000)
+    assert load_config(path / "wide", TrainConfig, ["steps=3000"]).steps == 3000 and wide.steps == 2000
+    for place, message in (
+        (path, r"several.yaml' holds several: add the name of one; allowed: plain, wide"),
+        (path / "wider", r"unknown configuration 'wider'.*wide"),
+        (path / "wrong", r"like none of those above it.*octopus"),
+        (path / "later", r"like none of those above it.*last"),
+        (tmp_path / "other.yaml" / "plain", "cannot be read"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            load_config(place, TrainConfig)
 
 
 def test_paths_in_options_and_names_of_policies(tmp_path):

@@ -100,7 +100,7 @@ def config(folder, model, name, *overrides):
     return load_config(path, model, overrides)
 
 
-TRAIN, FINGER, STRENGTH = "agents/finger_reach.yaml", "codesign/finger_reach.yaml", "design/finger_strength.yaml"
+TRAIN, FINGER, STRENGTH = "agents/sac.yaml/finger_reach", "codesign/finger_reach.yaml", "design/finger_strength.yaml"
 ZONE = "codesign/finger_zone.yaml"
 
 # Mistake -> (function of a temporary folder that makes it; the message, in which * stands for any text)

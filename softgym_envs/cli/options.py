@@ -17,10 +17,6 @@ if TYPE_CHECKING:
 
 PATH: Any = click.Path(path_type=Path)
 
-CONFIGS = Path(__file__).parents[1] / "configs"
-"""Folder of the shipped configurations."""
-
-
 VERBS = {
     "agents": "train, evaluate",
     "codesign": "codesign",
@@ -42,11 +38,6 @@ class Verbs(click.Group):
         return super().resolve_command(ctx, args)
 
 
-def shipped_configs(folder: str) -> list[str]:
-    """Return the names of the shipped configurations of one kind: ``"agents"``, ``"codesign"``, ..."""
-    return sorted(path.stem for path in (CONFIGS / folder).glob("*.yaml"))
-
-
 class ConfigFile(click.ParamType):
     """A YAML file, or the name of a shipped configuration of one kind."""
 
@@ -59,21 +50,25 @@ class ConfigFile(click.ParamType):
         path = Path(value)
         if path.exists() or path.suffix in (".yaml", ".yml") or path.name != str(value):
             return path
+        from softgym_envs.config import shipped_configs
+
         names = shipped_configs(self.folder)
         others = [verbs for folder, verbs in VERBS.items() if value in shipped_configs(folder)]
         if value not in names and others:
             raise ConfigError(f"configuration '{value}' is for {' and '.join(others)}; allowed: {', '.join(names)}")
         if value not in names:
             raise ConfigError(unknown_name("configuration file or name", value, names))
-        return CONFIGS / self.folder / f"{value}.yaml"
+        return names[str(value)]
 
     def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+        from softgym_envs.config import shipped_configs
+
         found = [CompletionItem(name) for name in shipped_configs(self.folder) if name.startswith(incomplete)]
         return found or [CompletionItem(incomplete, type="file")]
 
 
 def config(folder: str) -> Callable[[Callable], Callable]:
-    """Add ``--config``: a file, or the name of a shipped configuration in a folder of `CONFIGS`."""
+    """Add ``--config``: a file, or the name of a shipped configuration of one kind."""
     text = "YAML file of the run, or the name of a shipped one (softgym configs)."
     return click.option("--config", type=ConfigFile(folder), required=True, help=text)
 

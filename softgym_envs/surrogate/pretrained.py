@@ -1,4 +1,4 @@
-"""Weights shipped with the package, each made by ``softgym fit --config configs/surrogate/<weights name>.yaml``."""
+"""Weights shipped with the package, each made by ``softgym fit --config <weights name>``."""
 
 from __future__ import annotations
 

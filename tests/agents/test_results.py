@@ -12,12 +12,12 @@ from softgym_envs.agents import sweep
 from softgym_envs.agents.config import EnvironmentConfig, TrainConfig
 from softgym_envs.agents.results import draw_curves, load_runs, table
 from softgym_envs.agents.statistics import crossed_estimate, interquartile_mean, stratified_estimate
-from softgym_envs.config import load_config
+from softgym_envs.config import load_config, shipped_configs
 from softgym_envs.envs.registration import ENVIRONMENTS
 from softgym_envs.errors import ConfigError, DataError
 
 ROOT = Path(__file__).resolve().parents[2]
-CONFIGS = sorted((ROOT / "configs" / "agents").glob("*.yaml"))
+CONFIGS = list(shipped_configs("agents").values())
 
 TINY = """
 environment: {id: SoftGym/FingerReach-v0}

@@ -4,7 +4,6 @@ import csv
 import json
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,11 +16,9 @@ from softgym_envs.agents.learners.cloning import CloningLearner
 from softgym_envs.agents.learners.sac import SACLearner
 from softgym_envs.agents.policy import Policy
 from softgym_envs.agents.training import train
-from softgym_envs.config import load_config
+from softgym_envs.config import load_config, shipped_configs
 from softgym_envs.errors import ConfigError, DataError, WeightsError
 from tests.agents.interruption import interrupted_at
-
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 
 CONFIG = TrainConfig.model_validate(
     {
@@ -417,7 +414,7 @@ def test_goals_repeat_and_belong_to_the_body():
     ],
 )
 def test_shipped_policies_were_made_by_the_shipped_configs(name):
-    config = load_config(CONFIGS / "agents" / f"{name}.yaml", TrainConfig)
+    config = load_config(shipped_configs("agents")[name], TrainConfig)
     card = Policy(name).card
     assert TrainConfig.model_validate(card["config"]) == config
     assert card["steps"] == config.steps and not card["stopped_early"]

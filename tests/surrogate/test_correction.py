@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ import torch
 
 from softgym_envs import make_robot
 from softgym_envs.backends.torch_batch import TorchBatch
-from softgym_envs.config import load_config
+from softgym_envs.config import load_config, shipped_configs
 from softgym_envs.errors import DataError
 from softgym_envs.surrogate.correction import HIGHEST_ORDER, LOWEST_ORDER, EffortCorrection, fit_correction, order_of
 from softgym_envs.surrogate.potential.model import Model
@@ -20,7 +19,6 @@ from softgym_envs.surrogate.pretrained import pretrained_folder
 from softgym_envs.surrogate.training import FitConfig
 from softgym_envs.testing import random_states, untrained_potential
 
-ROOT = Path(__file__).resolve().parents[2]
 SIZES = (5.0, 3.0, 2.0)
 
 
@@ -156,7 +154,10 @@ def test_a_damaged_correction_is_refused(correction, message):
         Model(robot, plain.tensors, {"correction": correction})
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "configs" / "surrogate").glob("*_accurate.yaml")), ids=lambda p: p.stem)
+ACCURATE = [path for name, path in shipped_configs("surrogate").items() if name.endswith("_accurate")]
+
+
+@pytest.mark.parametrize("path", ACCURATE, ids=lambda p: p.stem)
 def test_configurations_of_accurate_meshes_fit_their_robots(path):
     config = load_config(path, FitConfig)
     robot = make_robot(config.robot, **config.robot_options)

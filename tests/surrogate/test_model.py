@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ import torch
 from safetensors.numpy import load_file, save_file
 
 from softgym_envs import make_robot
-from softgym_envs.config import load_config
+from softgym_envs.config import load_config, shipped_configs
 from softgym_envs.errors import DataError, WeightsError
 from softgym_envs.surrogate import online
 from softgym_envs.surrogate.baselines import residual
@@ -27,7 +26,6 @@ from softgym_envs.surrogate.weight_files import load_model
 from softgym_envs.testing import random_states, untrained_potential
 
 CABLES = (1, 2)
-CONFIGS = Path(__file__).resolve().parents[2] / "configs" / "surrogate"
 
 
 def untrained_residual(robot, seed=0):
@@ -358,7 +356,7 @@ def test_card_records_the_origin_of_the_weights(cables):
     assert card["network"] in NETWORKS
     assert card["test"]["positive_definite"] == 1.0
     assert card["states"]["test"] >= 500
-    config = load_config(CONFIGS / f"{robot.weights_name}.yaml", FitConfig)
+    config = load_config(shipped_configs("surrogate")[robot.weights_name], FitConfig)
     # How the data are generated does not count, and options that are newer than the weights had their defaults.
     known = FitConfig.model_validate({k: v for k, v in card["config"].items() if k != "workers"})
     apart = {"workers", "executor"}
