@@ -23,6 +23,7 @@ SECTIONS = {
     },
     "Robots": {
         "show": "robots:show",
+        "check": "check:check",
         "export": "robots:export",
     },
     "Surrogates": {
