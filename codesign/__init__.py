@@ -10,8 +10,10 @@ from softgym_envs._lazy import lazy_exports
 
 if TYPE_CHECKING:
     from softgym_envs.codesign.config import StudyConfig as StudyConfig
-    from softgym_envs.codesign.objectives import Objective as Objective
-    from softgym_envs.codesign.objectives import Outcome as Outcome
+    from softgym_envs.codesign.metrics.courses import Course as Course
+    from softgym_envs.codesign.metrics.metric import Metric as Metric
+    from softgym_envs.codesign.metrics.metric import metric as metric
+    from softgym_envs.codesign.metrics.sources import Outcome as Outcome
     from softgym_envs.codesign.report.page import write_report as write_report
     from softgym_envs.codesign.snapshot import load_study as load_study
     from softgym_envs.codesign.study import run_study as run_study
@@ -21,9 +23,6 @@ if TYPE_CHECKING:
     from softgym_envs.codesign.tools.config import SensitivityConfig as SensitivityConfig
     from softgym_envs.codesign.tools.gradient import optimise as optimise
     from softgym_envs.codesign.tools.measurements import measure as measure
-    from softgym_envs.codesign.tools.metrics import Course as Course
-    from softgym_envs.codesign.tools.metrics import Metric as Metric
-    from softgym_envs.codesign.tools.metrics import design_metric as design_metric
     from softgym_envs.codesign.tools.search import search as search
     from softgym_envs.codesign.tools.sensitivity import analyse_sensitivity as analyse_sensitivity
 
@@ -34,7 +33,9 @@ __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
     {
         "config": ["StudyConfig"],
-        "objectives": ["Objective", "Outcome"],
+        "metrics.courses": ["Course"],
+        "metrics.metric": ["Metric", "metric"],
+        "metrics.sources": ["Outcome"],
         "report.page": ["write_report"],
         "snapshot": ["load_study"],
         "study": ["run_study"],
@@ -42,7 +43,6 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "tools.config": ["CalibrationConfig", "OptimiseConfig", "SensitivityConfig"],
         "tools.gradient": ["optimise"],
         "tools.measurements": ["measure"],
-        "tools.metrics": ["Course", "Metric", "design_metric"],
         "tools.search": ["search"],
         "tools.sensitivity": ["analyse_sensitivity"],
     },

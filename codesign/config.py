@@ -10,7 +10,6 @@ from pydantic import Field, field_validator, model_validator
 
 from softgym_envs.agents.config import check_hindsight, check_start
 from softgym_envs.agents.joint import PROPOSERS
-from softgym_envs.codesign.objectives import PATH_OBJECTIVES
 from softgym_envs.codesign.parts import (
     PRUNERS,
     STRATEGIES,
@@ -44,7 +43,7 @@ class StudyConfig(StudyProblem):
             ``task.<option>``.
         ranges: bounds of those options.
         objective: what is optimised: the name of an objective, or one of your own as ``module:attribute``; in
-            Python also the function or `Objective` itself.
+            Python also the function or `Metric` itself.
         secondary_objectives: further objectives; the study then looks for the Pareto front of all of them.
         constraints: largest allowed values of objectives that are minimised, smallest of those that are maximised [SI];
             a body that violates one cannot win.
@@ -189,9 +188,9 @@ class StudyConfig(StudyProblem):
             environment.make_task(robot).touches,
             f"{ends} does not know what touches the body in task '{row.task}'{allowed}",
         )
-        for name in self.objectives:
+        for name, metric in self.objectives.items():
             refuse(
-                name in PATH_OBJECTIVES,
+                metric.over_path,
                 f"{ends} knows the ends of episodes only, but '{name}' is a mean over the steps{allowed}",
             )
         learner = self.training.learner

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
 from softgym_envs.agents.config import EnvironmentConfig
-from softgym_envs.codesign.objectives import OBJECTIVES, Objective, find_objective, objective_name
+from softgym_envs.codesign.metrics.metric import Metric, find_metric, metric_name
+from softgym_envs.codesign.metrics.sources import BODY, DESIGN, EPISODES
 from softgym_envs.codesign.variables import OptionRange, make_variables, split_values, with_options
 from softgym_envs.config import Config
 from softgym_envs.designs import DesignSpace, DesignVariable
@@ -45,12 +47,12 @@ class StudyProblem(Config):
     @field_validator("objective", mode="before")
     @classmethod
     def _importable(cls, objective: Any) -> str:
-        return objective_name(objective)
+        return metric_name(objective)
 
     @field_validator("secondary_objectives", mode="before")
     @classmethod
     def _all_importable(cls, objectives: Any) -> Any:
-        return [objective_name(o) for o in objectives] if isinstance(objectives, list | tuple) else objectives
+        return [metric_name(o) for o in objectives] if isinstance(objectives, list | tuple) else objectives
 
     @model_validator(mode="after")
     def _well_posed(self) -> Self:
@@ -58,11 +60,16 @@ class StudyProblem(Config):
         objectives = (self.objective, *self.secondary_objectives)
         for name in objectives:
             refuse(objectives.count(name) > 1, f"objective '{name}' is named twice")
-        allowed = ", ".join(name for name, objective in OBJECTIVES.items() if not objective.of_body)
+        for name, metric in self.objectives.items():  # looking them up also refuses unknown names
+            refuse(
+                metric.source not in (EPISODES, BODY, DESIGN),
+                f"metric '{name}' is read from {metric.source.name}, which a study does not compute; use it in a "
+                "search of designs",
+            )
         refuse(
-            self.primary.of_body,  # looking it up also refuses unknown names
+            self.primary.of_body,
             f"objective '{self.objective}' does not depend on the controller; use it in 'secondary_objectives' or "
-            f"'constraints', or run a design search; allowed: {allowed}",
+            "'constraints', or run a design search",
         )
         return self
 
@@ -82,21 +89,21 @@ class StudyProblem(Config):
         return make_variables(self.variables, self.ranges, self.space)
 
     @property
-    def objectives(self) -> dict[str, Objective]:
+    def objectives(self) -> dict[str, Metric]:
         """All objectives that the study names, by name: objective, secondary objectives and constraints."""
         names = (self.objective, *self.secondary_objectives, *self.constraints)
         return {name: self._find(name) for name in names}
 
-    def _find(self, name: str) -> Objective:
-        return find_objective(name, self.robot, self.environment.task_class)
+    def _find(self, name: str) -> Metric:
+        return replace(find_metric(name, self.robot, self.environment.task_class), name=name)
 
     @property
-    def shown_objectives(self) -> dict[str, Objective]:
+    def shown_objectives(self) -> dict[str, Metric]:
         """What every comparison of bodies shows, by name: the objective, success rate and final distance."""
         return {name: self._find(name) for name in dict.fromkeys((self.objective, "success_rate", "mean_distance"))}
 
     @property
-    def primary(self) -> Objective:
+    def primary(self) -> Metric:
         """The objective that decides who wins."""
         return self.objectives[self.objective]
 
@@ -126,12 +133,12 @@ class StudyProblem(Config):
         return "; ".join(broken)
 
     @property
-    def distance(self) -> Objective:
+    def distance(self) -> Metric:
         """Mean final distance, in the unit that people read for the task."""
         return self._find("mean_distance")
 
     @property
-    def effort(self) -> Objective:
+    def effort(self) -> Metric:
         """Mean effort of the actuators, in the unit that people read for the robot."""
         return self._find("mean_effort")
 

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Literal, Self
 import numpy as np
 
 from softgym_envs.agents.evaluation import Evaluation, none_for_nan
-from softgym_envs.codesign.objectives import Measurement
+from softgym_envs.codesign.metrics.metric import Measurement
 from softgym_envs.errors import DataError
 from softgym_envs.storage import read_json, write_json
 

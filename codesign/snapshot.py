@@ -13,7 +13,7 @@ import numpy as np
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.folder import SHARED_POLICY_RECORD, StudyFolder
 from softgym_envs.codesign.goals import Stratum, first_goals, missed_first
-from softgym_envs.codesign.objectives import Objective
+from softgym_envs.codesign.metrics.metric import Metric
 from softgym_envs.codesign.records import (
     REFINED,
     Account,
@@ -70,7 +70,7 @@ class StudySnapshot:
         return self.folder.config
 
     @property
-    def objective(self) -> Objective:
+    def objective(self) -> Metric:
         """The objective that decides who wins."""
         return self.config.primary
 

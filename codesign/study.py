@@ -16,7 +16,8 @@ import numpy as np
 from softgym_envs.agents.policy import Policy
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.folder import StudyFolder
-from softgym_envs.codesign.objectives import Objective, Outcome
+from softgym_envs.codesign.metrics.metric import Metric
+from softgym_envs.codesign.metrics.sources import Outcome
 from softgym_envs.codesign.phases.finalists import check_tests, finalist_jobs
 from softgym_envs.codesign.phases.screen import kept_bodies, screen_jobs
 from softgym_envs.codesign.phases.shared_policy import promising_bodies, shared_policy_jobs
@@ -44,7 +45,7 @@ def run_study(
     config: StudyConfig,
     folder: str | Path,
     *,
-    objective: str | Objective | Callable[[Outcome], Any] | None = None,
+    objective: str | Metric | Callable[[Outcome], Any] | None = None,
     workers: int | None = None,
     progress: bool = True,
 ) -> StudyResults:
@@ -57,7 +58,7 @@ def run_study(
     Args:
         config: the study.
         folder: where everything is written, see `StudyFolder`.
-        objective: objective to use instead of that of the configuration: a name, or a function or `Objective` that
+        objective: objective to use instead of that of the configuration: a name, or a function or `Metric` that
             workers can import.
         workers: number of workers; default: that of the configuration.
         progress: whether to print a line per finished trial and test.

@@ -8,7 +8,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from site_robots import EFFORT, MOVES, design_table, groups_of, robot_of
+from site_robots import MOVES, design_table, groups_of, robot_of
 from site_writing import code, options_of, page_name, picture, quantity, span, table
 
 import softgym_envs  # noqa: F401 - registers the environments
@@ -19,6 +19,7 @@ from softgym_envs.envs.options import EnvironmentOptions
 from softgym_envs.envs.spaces import AgentSpaces
 from softgym_envs.envs.tasks.registry import TASKS
 from softgym_envs.robots import Robot
+from softgym_envs.units import effort_unit
 
 
 def observation_scales(robot: Robot) -> dict[str, float]:
@@ -42,8 +43,8 @@ def environment_sections(identifier: str) -> dict[str, Callable[[], str]]:
     forces = goal_unit == "N"
     along = "" if task.axes.all() else " along " + " and ".join(np.array(list("xyz"))[task.axes > 0.0])
     unit = robot.actuators[0].unit
-    effort_unit = EFFORT.get(unit, "")
-    effort_scale = quantity(float(robot.effort_scale[0]), effort_unit)
+    force_unit = effort_unit(unit)
+    effort_scale = quantity(float(robot.effort_scale[0]), force_unit)
     effector = robot.effectors[0]
 
     def actions() -> str:
@@ -80,7 +81,7 @@ def environment_sections(identifier: str) -> dict[str, Callable[[], str]]:
         parts = [
             (n, f"commanded displacement of each {word}", "range to [-1, 1]", unit),
             (n, f"reached displacement of each {word}", f"range to [-1, 1], {clipped}", unit),
-            (n, f"{effort} of each {word}", f"x / (1 + abs(x)) of the {effort} over {scale}", effort_unit),
+            (n, f"{effort} of each {word}", f"x / (1 + abs(x)) of the {effort} over {scale}", force_unit),
             (3, measured, reach, goal_unit),
             (3, wanted, reach, goal_unit),
             (3, difference, f"x / (1 + abs(x)) of it over {error}", goal_unit),
@@ -170,7 +171,7 @@ def environment_sections(identifier: str) -> dict[str, Callable[[], str]]:
             f"`effector` [m], `goal` [{goal_unit}], `measured` [{goal_unit}] (what is compared with the goal), "
             f"`distance` ({error.strip()}), `is_success` (`distance` < "
             f"{limit}), `lost`, `reward_*` (the terms of the reward), `displacement` [{unit}], `effort` "
-            f"[{effort_unit}], `stable` (FEM: the tangent is positive definite), `converged`. `env.unwrapped.state` is "
+            f"[{force_unit}], `stable` (FEM: the tangent is positive definite), `converged`. `env.unwrapped.state` is "
             "the whole mechanical state, with the condensed model at `env.unwrapped.state.condensed` (`W.ea`, "
             "`delta_free.e`, ...)."
         )

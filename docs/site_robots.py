@@ -18,9 +18,8 @@ from softgym_envs.mechanics.elements.block import ElementBlock
 from softgym_envs.mechanics.elements.tetrahedra import SolidBlock
 from softgym_envs.robots import ROBOTS, Actuator, Robot
 from softgym_envs.surrogate.pretrained import pretrained_folder
+from softgym_envs.units import effort_unit
 
-EFFORT = {"m": "N", "m3": "Pa", "rad": "N m"}
-"""Unit of the effort conjugate to a displacement."""
 MOVES = {
     "m": "shortening of a cable",
     "m3": "growth of a chamber's volume",
@@ -55,7 +54,7 @@ def actuator_table(robot: Robot) -> str:
             span(members[0].low, members[0].high, members[0].unit),
             quantity(members[0].rate, members[0].unit),
             "no" if members[0].unilateral else "yes",
-            quantity(members[0].max_effort, EFFORT.get(members[0].unit, "")) if limited else "",
+            quantity(members[0].max_effort, effort_unit(members[0].unit)) if limited else "",
         ]
         for index, members in groups_of(robot.actuators)
     ]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 import softgym_envs  # noqa: F401 - registers the environments
 from softgym_envs import ENVIRONMENTS
 from softgym_envs.envs.tasks.registry import TASKS
+from softgym_envs.units import display
 
 DOCS = Path(__file__).resolve().parent
 HERE = "<!-- generated -->"
@@ -45,30 +45,26 @@ def describes(page: str) -> bool:
 
 # -- writing --------------------------------------------------------------------------------------------------------
 
-SHOWN = {
-    "m": (1e3, "mm"),
-    "m3": (1e9, "mm³"),
-    "Pa": (1e-3, "kPa"),
-    "rad": (180.0 / math.pi, "°"),
-}
-"""Factor from SI, and the unit that people read."""
-
 
 def number(value: float) -> str:
     """Write a number with up to six digits: ``3e6``, not ``3e+06``."""
     return re.sub(r"e([+-])0*(\d+)", lambda m: f"e{m[1].strip('+')}{m[2]}", f"{value:.6g}")
 
 
+def written(unit: str) -> str:
+    """Write the unit in which people read quantities in an SI unit: mm, cm³, °."""
+    return display(unit).unit.replace("deg", "°").replace("m3", "m³")
+
+
 def quantity(value: float, unit: str) -> str:
     """Write an SI value in the unit that people read."""
-    factor, shown = SHOWN.get(unit, (1.0, unit))
-    return f"{number(value * factor)} {shown}".strip()
+    return f"{number(value * display(unit).factor)} {written(unit)}".strip()
 
 
 def span(low: float, high: float, unit: str) -> str:
     """Write a range in the unit that people read."""
-    factor, shown = SHOWN.get(unit, (1.0, unit))
-    return f"{number(low * factor)} to {number(high * factor)} {shown}"
+    factor = display(unit).factor
+    return f"{number(low * factor)} to {number(high * factor)} {written(unit)}"
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

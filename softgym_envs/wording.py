@@ -1,4 +1,4 @@
-"""Numbers in text: decimals that do not hide a small value, and counts with their noun."""
+"""Numbers in text: decimals that do not hide a small value, counts with their noun, times."""
 
 from __future__ import annotations
 
@@ -35,3 +35,8 @@ def counted(count: int, noun: str) -> str:
         return f"{count} {noun}"
     plural = f"{noun[:-1]}ies" if noun.endswith("y") else f"{noun}es" if noun.endswith("s") else f"{noun}s"
     return f"{count} {plural}"
+
+
+def time_text(seconds: float) -> str:
+    """Return a time: ``"2.4 s"``, or ``"10.1 min"`` from a minute on."""
+    return f"{seconds:.1f} s" if seconds < 60.0 else f"{seconds / 60.0:.1f} min"

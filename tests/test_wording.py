@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from softgym_envs.codesign.objectives import OBJECTIVES
+from softgym_envs.codesign.metrics.metric import find_metric
 from softgym_envs.envs.tasks.base import LENGTHS
+from softgym_envs.envs.tasks.reach import Reach
 from softgym_envs.wording import counted, decimal
 
 ROOT = Path(__file__).parents[1]
@@ -36,7 +37,7 @@ def test_small_numbers_keep_two_digits(value, decimals, sign, text):
 
 
 def test_two_small_distances_are_told_apart():
-    measure = OBJECTIVES["mean_distance"]
+    measure = find_metric("mean_distance", task=Reach)
     assert [measure.text(value) for value in (2.8e-5, 2.5e-5)] == ["0.028 mm", "0.025 mm"]
     assert [LENGTHS.text(value) for value in (2.8e-5, 3.2e-3)] == ["0.028 mm", "3.2 mm"]
 

@@ -13,7 +13,8 @@ from softgym_envs.agents.config import EnvironmentConfig, TrainConfig
 from softgym_envs.agents.evaluation import Evaluation, evaluate
 from softgym_envs.agents.training import cpu_before, train
 from softgym_envs.codesign.folder import SHARED_POLICY, StudyFolder
-from softgym_envs.codesign.objectives import Objective, Outcome
+from softgym_envs.codesign.metrics.metric import Metric
+from softgym_envs.codesign.metrics.sources import Outcome
 from softgym_envs.codesign.phases.shared_policy import shared_policy
 from softgym_envs.codesign.problem import StudyProblem
 from softgym_envs.codesign.records import Assessment, TrialResult
@@ -221,7 +222,7 @@ class _Reporter:
     def __init__(
         self,
         trial: optuna.Trial,
-        objective: Objective,
+        objective: Metric,
         result: TrialResult,
         environment: EnvironmentConfig,
         *,

@@ -11,7 +11,7 @@ import numpy as np
 from softgym_envs.agents.evaluation import none_for_nan
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.goals import Stratum
-from softgym_envs.codesign.objectives import Objective
+from softgym_envs.codesign.metrics.metric import Metric
 from softgym_envs.codesign.records import REFINED, Finalist, TestGroup
 from softgym_envs.codesign.report.results import (
     BodyStatistics,
@@ -161,7 +161,7 @@ def _with_mesh(
     )
 
 
-def _statistics(group: TestGroup, objective: Objective) -> BodyStatistics:
+def _statistics(group: TestGroup, objective: Metric) -> BodyStatistics:
     mean, own = group.mean, group.objective_table
     return BodyStatistics(
         success_rate=mean.success_rate,
@@ -177,7 +177,7 @@ def _statistics(group: TestGroup, objective: Objective) -> BodyStatistics:
     )
 
 
-def _compare(baseline: TestGroup, winner: TestGroup, objective: Objective) -> Comparison:
+def _compare(baseline: TestGroup, winner: TestGroup, objective: Metric) -> Comparison:
     """Return winner minus baseline, goal by goal."""
     change = winner.mean.distances - baseline.mean.distances
     before, after = _statistics(baseline, objective), _statistics(winner, objective)
@@ -203,7 +203,7 @@ def _compare(baseline: TestGroup, winner: TestGroup, objective: Objective) -> Co
     )
 
 
-def _transfer(groups: list[TestGroup], objective: Objective) -> list[Transfer]:
+def _transfer(groups: list[TestGroup], objective: Metric) -> list[Transfer]:
     """Return an objective on surrogate and FEM over the finalists, for each controller."""
 
     def value(group: TestGroup) -> float:

@@ -13,11 +13,11 @@ from softgym_envs.codesign.phases.ends import episode_commands
 from softgym_envs.codesign.phases.finalists import finalist_environment, policy_file
 from softgym_envs.codesign.records import Finalist
 from softgym_envs.codesign.report.results import StudyResults
-from softgym_envs.codesign.report.units import shown_unit
 from softgym_envs.codesign.snapshot import StudySnapshot
 from softgym_envs.envs.tasks.base import Task
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Robot
+from softgym_envs.units import display
 
 MOMENTS = 6
 """Most states of an episode that are computed by finite elements, if these test only where episodes end."""
@@ -59,7 +59,7 @@ class Episode:
     @property
     def goal_text(self) -> str:
         """The last goal, as people read it: ``"(0.0, 30.0, -80.0) mm"``."""
-        unit, factor, _ = shown_unit(self.task.goal_unit)
+        unit, factor, _ = display(self.task.goal_unit)
         return f"({', '.join(f'{factor * value:.{1 if factor > 1.0 else 2}f}' for value in self.path[-1])}) {unit}"
 
     def distance_text(self, index: int) -> str:

@@ -9,8 +9,8 @@ import numpy as np
 from softgym_envs.codesign.records import REFINED
 from softgym_envs.codesign.report.results import StudyResults
 from softgym_envs.codesign.report.statistics import MIN_GOALS, mean_interval
-from softgym_envs.codesign.report.units import present
 from softgym_envs.codesign.snapshot import StudySnapshot
+from softgym_envs.units import present
 from softgym_envs.wording import counted
 
 NEGLIGIBLE = 0.1
@@ -107,7 +107,7 @@ def _mesh(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:
     if mesh.interval is None:
         return Finding("A finer mesh was tested", f"{text}With fewer than {MIN_GOALS} goals there is no interval.")
     low, high = (measure.number(end, "+") for end in mesh.interval)
-    text += f"With what is left of the mesh's error, the change at all goals is {low} to {high} {measure.unit}."
+    text += f"With what is left of the mesh's error, the change at all goals is {low} to {high} {measure.display.unit}."
     if mesh.interval[1] < 0.0:
         return Finding("A finer mesh agrees", text, warns=False)
     return Finding("With the mesh's error, the gain is not certain", text)

@@ -11,8 +11,8 @@ from softgym_envs.codesign.records import TrialResult
 from softgym_envs.codesign.report.episodes import Episode
 from softgym_envs.codesign.report.plots import BASELINE, COLOURS, MUTED, VIOLATES, WINNER
 from softgym_envs.codesign.report.results import StudyResults
-from softgym_envs.codesign.report.units import present, shown_unit
 from softgym_envs.codesign.snapshot import StudySnapshot
+from softgym_envs.units import display, present
 from softgym_envs.wording import decimal
 
 if TYPE_CHECKING:
@@ -126,11 +126,11 @@ def history(snapshot: StudySnapshot, results: StudyResults) -> Figure:
     figure = _figure(360, xaxis={"title": "trial", **_GRID}, yaxis={"title": objective.axis, **_GRID})
     feasible = [trial for trial in snapshot.trials if trial.feasible]
     if feasible:
-        best = objective.shown(np.maximum.accumulate([trial.score or 0.0 for trial in feasible]))
+        best = objective.value_of(np.maximum.accumulate([trial.score or 0.0 for trial in feasible]))
         numbers = [trial.number for trial in feasible]
         line = {"shape": "hv", "color": WINNER, "width": 1.6}
         figure.add_scatter(x=numbers, y=best, mode="lines", line=line, name="best so far", hoverinfo="skip")
-    _scatter(figure, snapshot, results, lambda t: t.number, lambda t: objective.shown(t.score))
+    _scatter(figure, snapshot, results, lambda t: t.number, lambda t: objective.value_of(t.score))
     return figure
 
 
@@ -148,10 +148,10 @@ def slices(snapshot: StudySnapshot, results: StudyResults) -> Figure:
         place = {"row": index // columns + 1, "col": index % columns + 1}
 
         def value(trial: TrialResult, name: str = variable.name, unit: str = variable.unit) -> float:
-            return {**trial.design, **trial.options}[name] * shown_unit(unit)[1]
+            return {**trial.design, **trial.options}[name] * display(unit).factor
 
-        _scatter(figure, snapshot, results, value, lambda t: objective.shown(t.score), legend=index == 0, **place)
-        unit = shown_unit(variable.unit)[0]
+        _scatter(figure, snapshot, results, value, lambda t: objective.value_of(t.score), legend=index == 0, **place)
+        unit = display(variable.unit).unit
         title = variable.name.replace("_", " ") + (f" [{unit}]" if unit else "")
         figure.update_xaxes(title=title, type="log" if variable.log else "linear", **_GRID, **place)
         figure.update_yaxes(title=objective.axis if index % columns == 0 else None, **_GRID, **place)

@@ -1,4 +1,4 @@
-"""Figures of a report, as SVG data for HTML, with the units of `softgym_envs.codesign.report.units`."""
+"""Figures of a report, as SVG data for HTML, with the units of `softgym_envs.units`."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softgym_envs.codesign.report.results import StudyResults
-from softgym_envs.codesign.report.units import present
 from softgym_envs.codesign.snapshot import StudySnapshot
+from softgym_envs.units import present
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -97,7 +97,7 @@ def _curves(
             label = role or "other bodies"
             ax.plot(
                 steps,
-                objective.shown(scores),
+                objective.value_of(scores),
                 line,
                 color=COLOURS.get(role, OTHER),
                 label=None if label in labelled else label,
@@ -121,10 +121,10 @@ def parallel(snapshot: StudySnapshot, results: StudyResults) -> str:
     variables = [variable for variable in results.variables if variable.optimised]
     roles = results.roles
     scores = np.array([t.score for t in done])
-    shown = np.array([objective.shown(score) for score in scores])
+    shown = np.array([objective.value_of(score) for score in scores])
     worst, best = scores.min(), scores.max() if np.ptp(scores) else scores.min() + 1.0
     colours = matplotlib.colormaps["viridis_r" if objective.sign < 0 else "viridis"]
-    ends = (objective.shown(worst), objective.shown(best))
+    ends = (objective.value_of(worst), objective.value_of(best))
     norm = Normalize(min(ends), max(ends))
     with _figure(6.2, 3.2) as (figure, (ax,), out):
         ax.grid(False)

@@ -7,15 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from softgym_envs.codesign.objectives import Objective
+from softgym_envs.codesign.metrics.metric import Metric
 from softgym_envs.codesign.report.collect import FEW_GOALS
 from softgym_envs.codesign.report.episodes import Episode
 from softgym_envs.codesign.report.results import Comparison, StudyResults
 from softgym_envs.codesign.report.statistics import MIN_GOALS, MeshPart, kendall_tau, rank_correlation
 from softgym_envs.codesign.report.tables import BACKENDS, SHOWN_ALWAYS, percent
-from softgym_envs.codesign.report.units import present, time_text
 from softgym_envs.codesign.snapshot import StudySnapshot
-from softgym_envs.wording import counted, decimal
+from softgym_envs.units import present
+from softgym_envs.wording import counted, decimal, time_text
 
 CONTROLLERS = {
     "warm_start": "a policy fine-tuned in each trial from a shared policy",
@@ -73,7 +73,7 @@ def why_untested(snapshot: StudySnapshot, results: StudyResults) -> str:
     return "the tests of winner and baseline are not finished"
 
 
-def _interval(interval: tuple[float, float] | None, measure: Objective, mesh: MeshPart | None = None) -> str:
+def _interval(interval: tuple[float, float] | None, measure: Metric, mesh: MeshPart | None = None) -> str:
     if interval is None:
         return ""
     low, high = (measure.number(end, "+") for end in sorted(interval))

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from functools import partial
 
 from softgym_envs.codesign.config import StudyConfig
-from softgym_envs.codesign.objectives import Objective
+from softgym_envs.codesign.metrics.metric import Metric
 from softgym_envs.codesign.records import REFINED, TrialResult
 from softgym_envs.codesign.report.results import Comparison, Cost, StudyResults, Transfer, VariableResult
 from softgym_envs.codesign.report.statistics import MeshPart
-from softgym_envs.codesign.report.units import present, shown_unit, time_text
 from softgym_envs.codesign.snapshot import StudySnapshot
-from softgym_envs.wording import decimal
+from softgym_envs.units import display, present
+from softgym_envs.wording import decimal, time_text
 
 AGENTS = {"policy": "Policy", "qp": "Inverse QP"}
 BACKENDS = {"fem": "FEM", REFINED: "FEM, finer mesh", "surrogate": "Surrogate"}
@@ -120,7 +120,7 @@ def percent(value: float) -> str:
 def design_row(variable: VariableResult) -> DesignRow:
     """Return a variable of baseline and winner."""
     unit, baseline, winner = variable.unit, variable.baseline, variable.winner
-    name, factor, decimals = shown_unit(unit)
+    name, factor, decimals = display(unit)
     change = "-"
     if winner is not None and winner != baseline:
         change = f"{decimal((winner - baseline) * factor, decimals, '+')}{' ' + name if name else ''}"
@@ -195,7 +195,7 @@ def comparison_row(row: Comparison, config: StudyConfig) -> ComparisonRow:
     )
 
 
-def effort_rows(comparison: Sequence[Comparison], effort: Objective) -> list[EffortRow]:
+def effort_rows(comparison: Sequence[Comparison], effort: Metric) -> list[EffortRow]:
     """Return the efforts of baseline and winner for each controller and backend."""
     return [
         EffortRow(
@@ -208,7 +208,7 @@ def effort_rows(comparison: Sequence[Comparison], effort: Objective) -> list[Eff
     ]
 
 
-def transfer_row(row: Transfer, objective: Objective) -> TransferRow:
+def transfer_row(row: Transfer, objective: Metric) -> TransferRow:
     """Return how an objective differs between surrogate and FEM."""
     return TransferRow(
         agent=AGENTS[row.agent],

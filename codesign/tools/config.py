@@ -7,11 +7,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
+from softgym_envs.codesign.metrics.metric import Metric, find_metric, metric_name
 from softgym_envs.codesign.sampling import SamplerConfig
-from softgym_envs.codesign.tools.bodies import Evaluator, LearnedBodies, check_metrics, full_command
+from softgym_envs.codesign.tools.bodies import Evaluator, LearnedBodies, check_derivatives, check_metrics, full_command
 from softgym_envs.codesign.tools.box import Box
-from softgym_envs.codesign.tools.grasps import GraspConfig
-from softgym_envs.codesign.tools.metrics import METRICS, Metric, find_metric
 from softgym_envs.codesign.tools.nuisance import ContactConfig, OffsetConfig, check_nuisances
 from softgym_envs.codesign.variables import OptionRange, change_options
 from softgym_envs.config import BesideConfig, Config
@@ -22,22 +21,14 @@ from softgym_envs.robots.registry import make_robot
 def _metric_name(value: Any) -> Any:
     """Return the name or path of a metric that may be given as an object."""
     if isinstance(value, Metric):
-        function = value.function
-        name = value.name if METRICS.get(value.name) is value else f"{function.__module__}:{function.__qualname__}"
-        try:
-            found = find_metric(name)
-        except ValueError:
-            found = None
-        if found is not value:
-            raise ValueError(f"metric '{value.name}' is not found as '{name}'; define it at the top of a module")
-        return name
+        return metric_name(value)
     if isinstance(value, str):
         find_metric(value)
     return value
 
 
 MetricName = Annotated[str, BeforeValidator(_metric_name)]
-"""Name in `softgym_envs.codesign.tools.metrics.METRICS`, or path of a metric of your own, ``"my_module:my_metric"``."""
+"""Name in `softgym_envs.codesign.metrics.metric.METRICS`, or place of a metric of your own, ``my_module:my_metric``."""
 
 FolderName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
 
@@ -80,8 +71,8 @@ class BodiesConfig(RobotConfig):
         default=None, description="full command: a displacement per actuator; default half of their upper limits"
     )
     steps: int = Field(default=1, ge=1, description="states beyond rest along the actuation")
-    grasps: tuple[GraspConfig, ...] = Field(
-        default=(GraspConfig(),), min_length=1, description="over which metrics of grasps are averaged"
+    sources: dict[str, Any] = Field(
+        default_factory=dict, description="settings of what metrics are computed from, such as the grasps"
     )
 
     @model_validator(mode="after")
@@ -105,7 +96,7 @@ class BodiesConfig(RobotConfig):
             steps=self.steps,
             weights=self.weights if backend == "surrogate" else None,
             make_robot=self.make_robot,
-            grasps=self.grasps,
+            sources=self.sources,
         )
 
     def learned(self, metrics: tuple[str, ...]) -> LearnedBodies:
@@ -206,7 +197,7 @@ class OptimiseConfig(Config):
 
     @model_validator(mode="after")
     def _consistent(self) -> OptimiseConfig:
-        check_metrics(self.bodies.make_robot(), self.metrics, self.bodies.backend)
+        metrics = check_metrics(self.bodies.make_robot(), self.metrics, self.bodies.backend, self.bodies.sources)
         box = self.bodies.box()
         if isinstance(self.solver, SearchConfig):
             for start in self.solver.starts:
@@ -216,8 +207,7 @@ class OptimiseConfig(Config):
             raise ValueError("solver 'gradient' needs bodies.backend = 'surrogate': FEM has no such derivatives")
         if box.options:
             raise ValueError(f"solver 'gradient' cannot vary the option '{box.options[0]}'; use solver 'search'")
-        if rigid := [o.metric for o in self.objectives if o.find().needs == "design"]:
-            raise ValueError(f"solver 'gradient' has no derivative of metric '{rigid[0]}'; use solver 'search'")
+        check_derivatives(metrics)
         return self
 
 
@@ -250,7 +240,7 @@ class SensitivityConfig(Config):
 
     @model_validator(mode="after")
     def _consistent(self) -> SensitivityConfig:
-        check_metrics(self.bodies.make_robot(), self.metrics, self.bodies.backend)
+        check_metrics(self.bodies.make_robot(), self.metrics, self.bodies.backend, self.bodies.sources)
         if self.method == "sobol" and self.samples & (self.samples - 1):
             raise ValueError(f"samples = {self.samples} must be a power of two for method 'sobol'")
         if self.method == "morris" and self.levels % 2:

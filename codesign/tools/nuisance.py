@@ -16,9 +16,7 @@ from softgym_envs.codesign.tools.measurements import columns_of
 from softgym_envs.config import Config
 from softgym_envs.errors import unknown_name
 from softgym_envs.robots.base import Robot
-
-EFFORT_UNITS = {"m": "N", "m3": "Pa"}
-"""Unit of the effort of an actuator by the unit of its displacement; other actuators turn, with efforts in N m."""
+from softgym_envs.units import effort_unit
 
 
 class NuisanceConfig(Config):
@@ -92,7 +90,7 @@ def check_nuisances(nuisances: Nuisances, robot: Robot, fitted: Sequence[str]) -
     displacement, effort, effector = columns_of(robot)
     units = {
         **{name: actuator.unit for name, actuator in zip(displacement, robot.actuators, strict=True)},
-        **{name: EFFORT_UNITS.get(a.unit, "N m") for name, a in zip(effort, robot.actuators, strict=True)},
+        **{name: effort_unit(a.unit) for name, a in zip(effort, robot.actuators, strict=True)},
         **dict.fromkeys(effector, "m"),
     }
     contacts = [name for name, nuisance in nuisances.items() if isinstance(nuisance, ContactConfig)]

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from softgym_envs.codesign.metrics.metric import Metric
 from softgym_envs.codesign.report.plots import BASELINE, MUTED, OTHER, STYLE, WINNER
-from softgym_envs.codesign.report.units import shown_unit
-from softgym_envs.codesign.tools.metrics import Metric
 from softgym_envs.codesign.tools.records import CalibrationResult
 from softgym_envs.storage import atomic_write
+from softgym_envs.units import display
 from softgym_envs.wording import counted
 
 
@@ -41,11 +41,11 @@ def draw_calibration(path: str | Path, units: Mapping[str, str], result: Calibra
             steps = np.arange(1, len(fit.history) + 1)
             axes[0].semilogy(steps, [row["cost"] for row in fit.history], marker=".", label=f"start {number}")
             for axis, (name, unit) in zip(axes[1:], units.items(), strict=True):
-                axis.plot(steps, [shown_unit(unit)[1] * row[name] for row in fit.history], marker=".")
+                axis.plot(steps, [display(unit).factor * row[name] for row in fit.history], marker=".")
         axes[0].set_ylabel("sum of squared relative residuals")
         axes[0].legend()
         for axis, (name, si_unit) in zip(axes[1:], units.items(), strict=True):
-            unit, scale, _ = shown_unit(si_unit)
+            unit, scale, _ = display(si_unit)
             axis.set_ylabel(name.replace("_", " ") + (f" [{unit}]" if unit else ""))
             if result.refined is not None:
                 axis.axhline(scale * result.refined.found[name], color=BASELINE, ls="--", label="refined on FEM")
@@ -75,11 +75,9 @@ def draw_descents(
         if len(metrics) > 1:
             x, y = metrics[:2]
             for values, size, color, name in ((grid, 6, MUTED, "grid"), (ends, 36, WINNER, "descents")):
-                axes[1].scatter(
-                    x.display_scale * values[:, 0], y.display_scale * values[:, 1], s=size, color=color, label=name
-                )
-            axes[1].set_xlabel(x.label)
-            axes[1].set_ylabel(y.label)
+                axes[1].scatter(x.scale * values[:, 0], y.scale * values[:, 1], s=size, color=color, label=name)
+            axes[1].set_xlabel(x.axis)
+            axes[1].set_ylabel(y.axis)
             axes[1].legend()
 
 
@@ -95,14 +93,14 @@ def draw_front(
     The values [SI] have the shape (n, m), in the order of evaluation, ``front`` has indices into them, and
     ``references`` has metrics [SI] of designs to compare with, by name.
     """
-    scale = np.array([metric.display_scale for metric in metrics])
+    scale = np.array([metric.scale for metric in metrics])
     shown = scale * values
     with figure(path, max(1, len(metrics) - 1), width=6.0, height=4.4) as axes:
         if len(metrics) == 1:
             axes[0].scatter(np.arange(len(shown)), shown[:, 0], s=7, color=MUTED)
             axes[0].scatter(front, shown[front, 0], s=36, color=WINNER, label="best")
             axes[0].set_xlabel("evaluation")
-            axes[0].set_ylabel(metrics[0].label)
+            axes[0].set_ylabel(metrics[0].axis)
         else:
             for k, axis in enumerate(axes, start=1):
                 x, y = shown[:, 0], shown[:, k]
@@ -112,8 +110,8 @@ def draw_front(
                     place = (scale[0] * point[0], scale[k] * point[k])
                     axis.scatter(*place, s=50, marker="D", color=BASELINE, zorder=3)
                     axis.annotate(name, place, xytext=(6, 5), textcoords="offset points")
-                axis.set_xlabel(metrics[0].label)
-                axis.set_ylabel(metrics[k].label)
+                axis.set_xlabel(metrics[0].axis)
+                axis.set_ylabel(metrics[k].axis)
         axes[0].legend()
 
 
@@ -130,11 +128,11 @@ def draw_sensitivity(
                 axis.barh(place, [table[v]["share"] for v in variables], color=WINNER)
                 axis.set_xlabel("share of the global range [%]")
             elif method == "morris":
-                scale = metric.display_scale
+                scale = metric.scale
                 size = [scale * table[v]["mu_star"] for v in variables]
                 error = [scale * table[v]["mu_star_interval"] for v in variables]
                 axis.barh(place, size, xerr=error, color=WINNER, ecolor=BASELINE)
-                axis.set_xlabel(f"mean elementary effect, {metric.display_unit} over the range")
+                axis.set_xlabel(f"mean elementary effect, {metric.display.unit} over the range")
             else:
                 for offset, key, color, words in (
                     (0.2, "first", WINNER, "first order"),

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
+from softgym_envs.codesign.metrics.metric import find_metric
 from softgym_envs.codesign.tools.bodies import Evaluator
 from softgym_envs.codesign.tools.box import Box
 from softgym_envs.codesign.tools.config import SensitivityConfig
 from softgym_envs.codesign.tools.evaluation import Evaluation, evaluate_each
 from softgym_envs.codesign.tools.folder import run_folder
-from softgym_envs.codesign.tools.metrics import find_metric
 from softgym_envs.codesign.tools.plots import draw_sensitivity
 from softgym_envs.codesign.tools.records import SensitivityResult
 from softgym_envs.config import code_changes, provenance

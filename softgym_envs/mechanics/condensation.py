@@ -16,11 +16,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from softgym_envs.units import effort_unit
+
 Roles = tuple[tuple[str, int], ...]
 """Role letters and sizes in order, e.g. ``(("a", 2), ("e", 3))``: actuators, effectors, contacts."""
 
 _ROLE_NAMES = {"a": "actuator", "e": "effector", "c": "contact", "t": "friction", "s": "sensor"}
-_EFFORT_UNITS = {"m": "N", "m3": "Pa", "rad": "N m", "1": "N m"}
 
 
 class Row(NamedTuple):
@@ -35,11 +36,6 @@ class Row(NamedTuple):
     name: str
     unit: str
     effort_unit: str
-
-
-def effort_unit(unit: str) -> str:
-    """Return the unit of the effort conjugate to a displacement in ``unit``, e.g. N for m."""
-    return _EFFORT_UNITS.get(unit, f"J/{unit}")
 
 
 def point_rows(name: str, unit: str = "m") -> list[Row]:

@@ -15,12 +15,13 @@ from typing import Any, ClassVar
 import numpy as np
 
 from softgym_envs.mechanics.compilation import njit
-from softgym_envs.mechanics.condensation import CondensedModel, Roles, Row, effort_unit, point_rows
+from softgym_envs.mechanics.condensation import CondensedModel, Roles, Row, point_rows
 from softgym_envs.mechanics.solvers.complementarity import solve_rows
 from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.correction import EffortCorrection
 from softgym_envs.surrogate.domain import SOFT, Domain, judge
 from softgym_envs.surrogate.features import Features
+from softgym_envs.units import effort_unit
 
 
 @njit(cache=True, error_model="numpy")

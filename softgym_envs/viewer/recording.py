@@ -20,18 +20,12 @@ from softgym_envs.envs.tasks.base import LENGTHS, DistanceScale
 from softgym_envs.extras import require
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Robot
+from softgym_envs.units import display, effort_unit
 from softgym_envs.viewer.scene import COLORS, STUB, tension_color
 from softgym_envs.viewer.surface import BodySurface, ShapeFinder, cable_lines
 
 Agent = Callable[[np.ndarray, SoftRobotEnv], np.ndarray]
 """Maps an observation and the environment, unwrapped, to an action."""
-
-# By the unit of an actuator: unit of the plotted displacement, factor to that unit, unit of the effort.
-_PLOTTED: dict[str, tuple[str, float, str]] = {
-    "m": ("mm", 1e3, "N"),
-    "m3": ("ml", 1e6, "Pa"),
-    "rad": ("deg", 180.0 / np.pi, "N m"),
-}
 
 
 class RolloutRecorder:
@@ -172,8 +166,7 @@ class RolloutRecorder:
         if reward is not None:
             self._plot("reward", reward)
         for row, actuator in enumerate(self.robot.actuators):
-            factor = _PLOTTED.get(actuator.unit, ("", 1.0, ""))[1]
-            self._plot(f"displacement/{actuator.name}", factor * state.displacement[row])
+            self._plot(f"displacement/{actuator.name}", display(actuator.unit).factor * state.displacement[row])
             self._plot(f"effort/{actuator.name}", state.effort[row])
 
     def _log_names(self) -> None:
@@ -183,9 +176,8 @@ class RolloutRecorder:
         scale = self.distance_scale
         names = {"distance": f"{scale.name} [{scale.unit}]", "reward": "reward"}
         for actuator in self.robot.actuators:
-            unit, _, effort = _PLOTTED.get(actuator.unit, (actuator.unit, 1.0, "SI"))
-            names[f"displacement/{actuator.name}"] = f"{actuator.name} [{unit}]"
-            names[f"effort/{actuator.name}"] = f"{actuator.name} [{effort}]"
+            names[f"displacement/{actuator.name}"] = f"{actuator.name} [{display(actuator.unit).unit}]"
+            names[f"effort/{actuator.name}"] = f"{actuator.name} [{effort_unit(actuator.unit)}]"
         for entity, name in names.items():
             label = f"{self._root.rstrip('/')} {name}".strip()
             self._stream.log(f"{self._root}plots/{entity}", rerun.SeriesLines(names=label), static=True)

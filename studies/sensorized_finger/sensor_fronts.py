@@ -32,8 +32,8 @@ def front(stem: str) -> dict[str, object]:
     Args:
         stem: name of the configuration in ``configs/design``.
     """
+    from softgym_envs.codesign.metrics.metric import METRICS
     from softgym_envs.codesign.tools.config import OptimiseConfig
-    from softgym_envs.codesign.tools.metrics import METRICS
     from softgym_envs.codesign.tools.plots import draw_front
     from softgym_envs.codesign.tools.search import search
     from softgym_envs.config import load_config
@@ -43,10 +43,10 @@ def front(stem: str) -> dict[str, object]:
     began = time.perf_counter()
     found = search(config, folder)
     metrics = tuple(objective.metric for objective in config.objectives)
-    units = ", ".join(METRICS[name].display_unit for name in metrics)
+    units = ", ".join(METRICS[name].display.unit for name in metrics)
 
     def shown(values: dict[str, float]) -> list[float]:
-        return [float(f"{METRICS[name].display_scale * values[name]:.4g}") for name in metrics]
+        return [float(f"{METRICS[name].scale * values[name]:.4g}") for name in metrics]
 
     evaluator, space = config.bodies.evaluator(metrics), config.bodies.make_robot().design_space
     built = {name: evaluator(space.complete(design)) for name, design in DESIGNS.items()}

@@ -49,7 +49,7 @@ BAD = {
     "misspelt objective": ({"objective": "mean_distnace"}, "mean_distnace", "did you mean 'mean_distance'?"),
     "objective of a module that does not exist": ({"objective": "no_module:f"}, "no_module:f", "no module"),
     "objective that its module lacks": ({"objective": "math:beauty"}, "math:beauty", "has no 'beauty'"),
-    "objective that is not a function": ({"objective": "math:pi"}, "math:pi", "an Objective or a function"),
+    "objective that is not a function": ({"objective": "math:pi"}, "math:pi", "a Metric or a function"),
     "constraint that is not a number": (
         {"constraints": {"mean_effort": float("nan")}},
         "constraints.mean_effort",

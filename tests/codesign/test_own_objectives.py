@@ -7,8 +7,9 @@ import pytest
 
 from softgym_envs import make_robot
 from softgym_envs.agents.evaluation import Evaluation
-from softgym_envs.codesign import Objective, StudyConfig, load_study, run_study, write_report
-from softgym_envs.codesign.objectives import OBJECTIVES, Outcome, find_objective, objective_name
+from softgym_envs.codesign import Metric, StudyConfig, load_study, run_study, write_report
+from softgym_envs.codesign.metrics.metric import METRICS, find_metric, metric, metric_name
+from softgym_envs.codesign.metrics.sources import Outcome
 from softgym_envs.envs.tasks.grasp import Grasp
 from softgym_envs.envs.tasks.reach import Reach
 from softgym_envs.robots.soft_finger import SoftFinger
@@ -22,9 +23,10 @@ def effort_per_reach(outcome):
     return outcome.evaluation.efforts * (1.0 + outcome.evaluation.distances / 1e-3)
 
 
-lightness = Objective(
-    "lightness", lambda outcome: 1.0 / outcome.model.volume, "Lightness", "1/cm3", 1e-6, maximize=True, of_body=True
-)
+@metric("1/m3", "maximize", "body")
+def lightness(model):
+    """Volume that would be as light as the body."""
+    return 1.0 / model.volume
 
 
 class StiffFinger(SoftFinger):
@@ -43,32 +45,32 @@ def outcome(distances, efforts):
 
 
 def test_names_of_objectives():
-    assert objective_name("mean_distance") == objective_name(OBJECTIVES["mean_distance"]) == "mean_distance"
-    assert objective_name(effort_per_reach) == f"{__name__}:effort_per_reach"
-    assert objective_name(lightness) == f"{__name__}:lightness"
+    assert metric_name("mean_distance") == metric_name(METRICS["mean_distance"]) == "mean_distance"
+    assert metric_name(effort_per_reach) == f"{__name__}:effort_per_reach"
+    assert metric_name(lightness) == f"{__name__}:lightness"
     with pytest.raises(ValueError, match="cannot be imported by workers: define it at the top level of a module"):
-        objective_name(lambda outcome: 0.0)
+        metric_name(lambda outcome: 0.0)
 
 
 def test_units_of_efforts_are_those_of_the_robot():
-    assert find_objective("mean_effort", ROBOT, Reach).text(2.0) == "2.00 N"
-    assert find_objective("mean_effort", make_robot("trunk"), Reach).text(2e3) == "2.00 kPa"
-    assert find_objective("mean_effort", Tetrapod(), Reach).text(2.0) == "2.00 N m"
+    assert find_metric("mean_effort", ROBOT, Reach).text(2.0) == "2.00 N"
+    assert find_metric("mean_effort", make_robot("trunk"), Reach).text(2e3) == "2.00 kPa"
+    assert find_metric("mean_effort", Tetrapod(), Reach).text(2.0) == "2.00 N m"
 
 
 @pytest.mark.parametrize("name, label", [("mean_distance", "Mean final"), ("mean_tracking_distance", "Mean tracking")])
 def test_units_of_distances_are_those_of_the_task(name, label):
-    lengths, errors = (find_objective(name, ROBOT, task) for task in (Reach, Grasp))
+    lengths, errors = (find_metric(name, ROBOT, task) for task in (Reach, Grasp))
     assert (lengths.text(0.002), lengths.label) == ("2.00 mm", f"{label} distance")
     assert (errors.text(0.05), errors.text(-0.01, "+"), errors.label) == ("5.0 %", "-1.0 pp", f"{label} error")
 
 
 def test_measurements():
-    found = find_objective(f"{__name__}:effort_per_reach", ROBOT, Reach)
+    found = find_metric(f"{__name__}:effort_per_reach", ROBOT, Reach)
     assert (found.label, found.sign) == ("Effort per reach", -1)
     measured = found.measure(outcome([0.0, 1e-3], [1.0, 2.0]))
     assert (measured.value, measured.per_goal) == (2.5, [1.0, 4.0])
-    body = find_objective(f"{__name__}:lightness", ROBOT, Reach).measure(outcome([0.0], [1.0]))
+    body = find_metric(f"{__name__}:lightness", ROBOT, Reach).measure(outcome([0.0], [1.0]))
     assert body.per_goal is None and body.value == pytest.approx(1.0 / ROBOT.build().volume)
 
 
@@ -82,7 +84,7 @@ def test_measurements():
 )
 def test_wrong_values_of_an_objective(returned, message):
     with pytest.raises(ValueError, match=message):
-        Objective("my:own", lambda outcome: returned, "Own").measure(outcome([0.0, 0.0], [1.0, 1.0]))
+        Metric("my:own", lambda outcome: returned).measure(outcome([0.0, 0.0], [1.0, 1.0]))
 
 
 def test_study_with_an_objective_of_ones_own(tmp_path, tiny):

@@ -15,9 +15,9 @@ from softgym_envs.codesign.report.episodes import typical_goal
 from softgym_envs.codesign.report.findings import findings
 from softgym_envs.codesign.report.interactive import goal_outcomes, goal_views, history, slices
 from softgym_envs.codesign.report.tables import effort_rows
-from softgym_envs.codesign.report.units import time_text
 from softgym_envs.codesign.snapshot import load_study
 from softgym_envs.viewer.video import write_video
+from softgym_envs.wording import time_text
 
 BOX = {"height": (0.020, 0.022), "joint_height": (0.005, 0.008)}
 

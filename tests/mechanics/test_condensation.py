@@ -13,7 +13,7 @@ import pickle
 import numpy as np
 import pytest
 
-from softgym_envs.mechanics.condensation import CondensedModel, effort_unit
+from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.constraints.bond import Bond
 from softgym_envs.mechanics.constraints.cable import Cable
 from softgym_envs.mechanics.constraints.cavity import Cavity
@@ -22,6 +22,7 @@ from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.constraints.servo import Servo
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
+from softgym_envs.units import effort_unit
 
 FORCE, LENGTH = 1e-3, 1e-6
 

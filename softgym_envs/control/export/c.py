@@ -11,7 +11,6 @@ import numpy as np
 from softgym_envs.backends.surrogate import solve_displacements
 from softgym_envs.control.embedded import MAX_SETTLING_STEPS, SETTLED, SLACK, PICorrection, settling_span
 from softgym_envs.control.inverse_qp import InverseQP
-from softgym_envs.mechanics.condensation import effort_unit
 from softgym_envs.robots.base import Robot
 from softgym_envs.storage import atomic_write
 from softgym_envs.surrogate.export.c import header_text
@@ -19,6 +18,7 @@ from softgym_envs.surrogate.export.c_text import check_identifier, comment, func
 from softgym_envs.surrogate.export.common import exportable
 from softgym_envs.surrogate.model import SurrogateModel
 from softgym_envs.surrogate.potential.model import Model
+from softgym_envs.units import effort_unit
 from softgym_envs.version import __version__
 from softgym_envs.wording import counted
 

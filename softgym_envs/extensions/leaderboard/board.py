@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from softgym_envs.agents.statistics import Estimate, stratified_estimate
-from softgym_envs.codesign.objectives import Objective
+from softgym_envs.codesign.metrics.metric import Metric
 from softgym_envs.errors import DataError
 from softgym_envs.extensions.leaderboard.frozen import load_definition, load_problem, problem_names
 from softgym_envs.extensions.leaderboard.problem import TRACKS
@@ -223,8 +223,8 @@ def reference_table(data: Path = DATA) -> str:
             continue
         unit = load_definition(name).primary
 
-        def shown(score: float, unit: Objective = unit) -> str:
-            return f"{unit.sign * unit.scale * score:.4g} {unit.unit}"
+        def shown(score: float, unit: Metric = unit) -> str:
+            return f"{unit.sign * unit.scale * score:.4g} {unit.display.unit}"
 
         best, found = "none better is known", "-"
         if known.best:
@@ -251,6 +251,7 @@ def winners_table(data: Path = DATA) -> str:
     for name in sorted({row.problem for row in rows}):
         problem = load_problem(name, check=False)
         unit, sign = problem.definition.primary, problem.definition.primary.sign
+        shown = unit.display.unit
         members = [row for row in rows if row.problem == name]
         for row in sorted((row for row in members if row.median), key=lambda row: -row.surrogate):
             fem = "no equilibrium" if row.fem is None else f"{sign * unit.scale * row.fem:.4f}"
@@ -259,7 +260,7 @@ def winners_table(data: Path = DATA) -> str:
         gaps = unit.scale * np.array([row.exploitation for row in members if row.fem is not None])
         notes.append(
             f"* `{name}`: {counted(len(members), 'winner')}; exploitation {gaps.min():.4f} to {gaps.max():.4f} "
-            f"{unit.unit}, mean {gaps.mean():.4f} {unit.unit}; Kendall's tau {rank_correlation(members):.2f}."
+            f"{shown}, mean {gaps.mean():.4f} {shown}; Kendall's tau {rank_correlation(members):.2f}."
         )
     header = ["problem", "method", "median seed", "learned model [mm]", "finite elements [mm]", "exploitation [mm]"]
     return _table(header, cells) + "\n\n" + "\n".join(notes)

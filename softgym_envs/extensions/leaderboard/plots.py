@@ -11,12 +11,12 @@ import numpy as np
 
 from softgym_envs.agents.statistics import interquartile_mean
 from softgym_envs.codesign.report.plots import STYLE, draw_silhouette, silhouette
-from softgym_envs.codesign.report.units import present
 from softgym_envs.extensions.leaderboard.frozen import load_problem, problem_names
 from softgym_envs.extensions.leaderboard.problem import BenchmarkProblem
 from softgym_envs.extensions.leaderboard.regret import EQUAL, Contest, Stored, contests
 from softgym_envs.extensions.leaderboard.runs import stored_runs
 from softgym_envs.extensions.leaderboard.scoring import DATA, reference
+from softgym_envs.units import present
 
 COLOURS = {
     "random": "#94a3b8",

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from softgym_envs.mechanics.condensation import effort_unit
 from softgym_envs.surrogate.model import SurrogateModel
 from softgym_envs.surrogate.potential.model import Model
+from softgym_envs.units import effort_unit
 
 FORMATS = (".h", ".onnx")
 """File endings of the export formats."""

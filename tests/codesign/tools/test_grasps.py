@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from softgym_envs import make_robot
+from softgym_envs.codesign.metrics.grasps import GraspConfig
 from softgym_envs.codesign.tools.bodies import Evaluator
 from softgym_envs.codesign.tools.config import OptimiseConfig, SensitivityConfig
 from softgym_envs.codesign.tools.evaluation import evaluate
-from softgym_envs.codesign.tools.grasps import GraspConfig
 from softgym_envs.config import load_config
 from softgym_envs.errors import ConfigError, ConvergenceError, InfeasibleDesign
 
@@ -44,7 +44,7 @@ def test_scene_of_a_grasp(finger, monkeypatch):
         seen.append((target, options))
         return grasp_of()
 
-    monkeypatch.setattr("softgym_envs.codesign.tools.grasps.evaluate_grasp", record)
+    monkeypatch.setattr("softgym_envs.codesign.metrics.grasps.evaluate_grasp", record)
     GraspConfig(kind="sphere", distance=0.02, height=0.07, size=0.04, friction=0.3, angles=7).evaluate(finger, {})
     (target, options) = seen[0]
     assert (target.kind, target.distance, target.height, target.size, target.friction) == (
@@ -59,7 +59,7 @@ def test_scene_of_a_grasp(finger, monkeypatch):
 
 @pytest.mark.parametrize(("status", "error"), [("infeasible", InfeasibleDesign), ("no equilibrium", ConvergenceError)])
 def test_failed_grasps_are_infeasible_evaluations(finger, monkeypatch, status, error):
-    monkeypatch.setattr("softgym_envs.codesign.tools.grasps.evaluate_grasp", lambda *a, **b: grasp_of(status))
+    monkeypatch.setattr("softgym_envs.codesign.metrics.grasps.evaluate_grasp", lambda *a, **b: grasp_of(status))
     with pytest.raises(error, match="why"):
         GraspConfig().evaluate(finger, {})
     found = evaluate(Evaluator(finger, ["grip_force"]), finger.design_space.baseline)
@@ -69,8 +69,8 @@ def test_failed_grasps_are_infeasible_evaluations(finger, monkeypatch, status, e
 def test_metrics_are_means_over_grasps(finger, monkeypatch):
     forces = {0.3: 1.0, 0.85: 3.0}
     monkeypatch.setattr(GraspConfig, "evaluate", lambda self, robot, design: grasp_of(force=forces[self.friction]))
-    grasps = [GraspConfig(friction=friction) for friction in forces]
-    evaluator = Evaluator(finger, ["grip_force", "grip_energy"], grasps=grasps)
+    grasps = [{"friction": friction} for friction in forces]
+    evaluator = Evaluator(finger, ["grip_force", "grip_energy"], sources={"grasps": grasps})
     assert evaluator(finger.design_space.baseline) == {"grip_force": 2.0, "grip_energy": 1.0}
 
 

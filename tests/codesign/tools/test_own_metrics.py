@@ -7,9 +7,9 @@ import csv
 import pytest
 
 from softgym_envs import make_robot
+from softgym_envs.codesign.metrics.metric import METRICS, Metric, find_metric, metric
 from softgym_envs.codesign.tools.bodies import Evaluator
 from softgym_envs.codesign.tools.config import BodiesConfig, ObjectiveConfig, OptimiseConfig, SensitivityConfig
-from softgym_envs.codesign.tools.metrics import METRICS, Metric, design_metric, find_metric
 from softgym_envs.codesign.tools.search import search
 from softgym_envs.codesign.tools.sensitivity import analyse_sensitivity
 from softgym_envs.config import check_config, load_config
@@ -23,7 +23,7 @@ BODIES = {
 }
 
 
-@design_metric(unit="kg", direction="minimize")
+@metric(unit="kg", direction="minimize", source="design")
 def mass(design):
     """Return the mass of a silicone finger."""
     return 1.1e3 * 3.0 * design["length"] * design["height"] ** 2
@@ -34,7 +34,7 @@ def height_of_tip(course):
     return course.effector[-1, :, 2]
 
 
-tip_height = Metric("tip_height", height_of_tip, "m", "maximize")
+tip_height = Metric("tip_height", height_of_tip, "m", "maximize", "states")
 
 
 @pytest.fixture
@@ -60,8 +60,8 @@ def test_a_metric_of_the_design_and_one_of_the_states(importable):
     assert found["mass"] == pytest.approx(1.1e3 * 3.0 * 0.04 * 0.021**2)
     assert -0.12 < found["tip_height"] < 0.0 < found["travel"]
     assert find_metric("own_metrics:mass") is mass and find_metric(tip_height) is tip_height
-    assert mass.description == "Return the mass of a silicone finger." and mass.label == "mass [kg]"
-    assert tip_height.label == "tip height [mm]"
+    assert mass.description == "Return the mass of a silicone finger." and mass.axis == "Mass [kg]"
+    assert tip_height.axis == "Tip height [mm]"
 
 
 def test_a_search_for_a_metric_of_ones_own(importable, tmp_path):
@@ -85,8 +85,10 @@ def test_sensitivity_of_a_metric_of_ones_own(importable, tmp_path):
 def test_metrics_as_objects_become_names():
     assert ObjectiveConfig(metric=METRICS["travel"]).metric == "travel"
     assert ObjectiveConfig(metric=mass).metric == f"{mass.function.__module__}:mass"
-    with pytest.raises(ValueError, match="is not found as"):
-        ObjectiveConfig(metric=Metric("tip_height", lambda course: course.effector[-1, :, 2], "m", "maximize"))
+    with pytest.raises(ValueError, match="cannot be imported by workers"):
+        ObjectiveConfig(
+            metric=Metric("tip_height", lambda course: course.effector[-1, :, 2], "m", "maximize", "states")
+        )
 
 
 def test_a_robot_option_as_a_variable(tmp_path):
@@ -115,10 +117,10 @@ def test_a_robot_option_as_a_variable(tmp_path):
 
 WRONG_METRICS = [
     ("bending_angel", r"unknown metric 'bending_angel'; did you mean 'bending_angle'\?"),
-    ("beauty", "unknown metric 'beauty'; allowed: bending_angle, .*, or a metric of your own as my_module:my_metric"),
+    ("beauty", "unknown metric 'beauty'; allowed: .*bending_angle.*, or one of your own as 'module:attribute'"),
     ("own_metrics:weight", "metric 'own_metrics:weight': module 'own_metrics' has no 'weight'"),
     ("no_such_module:mass", "metric 'no_such_module:mass': there is no module 'no_such_module'"),
-    ("own_metrics:height_of_tip", "is a function without a unit; decorate the function with @design_metric"),
+    ("own_metrics:height_of_tip", "metric 'height_of_tip' needs episodes of a controller, which only a study has"),
 ]
 WRONG_BODIES = [
     ({"robot": "fingr"}, r"unknown robot 'fingr'; did you mean 'finger'\?"),
@@ -129,7 +131,7 @@ WRONG_BODIES = [
     ({"variables": ["robot.mesh_size"]}, "'robot.mesh_size' is an option: give its low"),
 ]
 WRONG_SOLVERS = [
-    ({"method": "gradient"}, "no derivative of metric 'own_metrics:mass'"),
+    ({"method": "gradient"}, "metric 'mass' has no derivative by the design"),
     ({"method": "serach"}, "'serach'"),
     ({"method": "search", "sampler": {"name": "tpr"}}, "'tpe'"),
 ]
@@ -139,10 +141,10 @@ def one_line(error):
     return "\n" not in str(error.value) and "more problem" not in str(error.value)
 
 
-@pytest.mark.parametrize(("metric", "message"), WRONG_METRICS)
-def test_wrong_metrics(importable, metric, message):
+@pytest.mark.parametrize(("name", "message"), WRONG_METRICS)
+def test_wrong_metrics(importable, name, message):
     with pytest.raises(ConfigError, match=message) as error:
-        optimisation([metric])
+        optimisation([name])
     assert one_line(error)
     with pytest.raises(ConfigError, match="metric 'mass' is named twice"):
         optimisation(["own_metrics:mass", "own_metrics:mass"])

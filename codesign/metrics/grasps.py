@@ -1,17 +1,23 @@
-"""Configuration of the grasps over which a design tool averages."""
+"""Metrics of grasps: a contact-aided finger closes on objects, over which metrics are averaged."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Literal
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, TypeAdapter
 
+from softgym_envs.codesign.metrics.metric import metric
+from softgym_envs.codesign.metrics.sources import Source, needs_fem
 from softgym_envs.config import Config
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 from softgym_envs.robots.contact_aided_finger import ContactAidedFinger
 from softgym_envs.robots.grasping import Grasp, GraspObject, evaluate_grasp
+
+if TYPE_CHECKING:
+    from softgym_envs.codesign.tools.bodies import Body
+    from softgym_envs.robots.base import Robot
 
 
 class GraspConfig(Config):
@@ -47,3 +53,42 @@ class GraspConfig(Config):
         if found.status == "no equilibrium":
             raise ConvergenceError(found.reason)
         return found
+
+
+_GRASPS: TypeAdapter[tuple[GraspConfig, ...]] = TypeAdapter(Annotated[tuple[GraspConfig, ...], Field(min_length=1)])
+
+
+def _settings(data: Any) -> tuple[GraspConfig, ...]:
+    return (GraspConfig(),) if data is None else _GRASPS.validate_python(data)
+
+
+def _refuse(robot: Robot, backend: str) -> str:
+    lacking = "" if isinstance(robot, ContactAidedFinger) else f"robot 'contact_aided_finger', got '{robot.name}'"
+    return needs_fem(robot, backend) or lacking
+
+
+def _close(body: Body) -> list[Grasp]:
+    assert isinstance(body.robot, ContactAidedFinger)
+    return [grasp.evaluate(body.robot, body.variables) for grasp in body.settings["grasps"]]
+
+
+GRASPS = Source("grasps", _close, _refuse, _settings)
+"""All grasps of a contact-aided finger; their settings are a list of `GraspConfig`."""
+
+
+@metric("N", "maximize", GRASPS)
+def grip_force(grasps: Sequence[Grasp]) -> float:
+    """Return the largest force on the object along x (thesis, eq. 3.10), the mean over the grasps."""
+    return sum(grasp.contact_force for grasp in grasps) / len(grasps)
+
+
+@metric("m", "minimize", GRASPS)
+def grip_resistance(grasps: Sequence[Grasp]) -> float:
+    """Return the smallest torque per force on the object (thesis, eq. 3.11), the mean over the grasps."""
+    return sum(grasp.grasp_resistance for grasp in grasps) / len(grasps)
+
+
+@metric("N m", "minimize", GRASPS)
+def grip_energy(grasps: Sequence[Grasp]) -> float:
+    """Return the sum of torque times angle over all angles (thesis, eq. 3.13), the mean over the grasps."""
+    return sum(grasp.grasp_energy for grasp in grasps) / len(grasps)

@@ -1,0 +1,56 @@
+"""Metrics of a body with its controller, and of the body alone."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from softgym_envs.codesign.metrics.metric import metric
+from softgym_envs.codesign.metrics.sources import Outcome
+from softgym_envs.units import PERCENT
+
+if TYPE_CHECKING:
+    from softgym_envs.mechanics.model import MechanicalModel
+
+
+@metric(direction="maximize", shown=PERCENT)
+def success_rate(outcome: Outcome) -> np.ndarray:
+    """Return whether the effector reaches each goal."""
+    return outcome.evaluation.successes
+
+
+@metric("distance", label="Mean final distance")
+def mean_distance(outcome: Outcome) -> np.ndarray:
+    """Return the distance to the goal at the end of each episode."""
+    return outcome.evaluation.distances
+
+
+@metric(direction="maximize", over_path=True)
+def mean_return(outcome: Outcome) -> np.ndarray:
+    """Return the sum of the rewards of each episode."""
+    return outcome.evaluation.returns
+
+
+@metric("distance", over_path=True)
+def mean_tracking_distance(outcome: Outcome) -> np.ndarray:
+    """Return the mean distance to the goal over the steps of each episode."""
+    return outcome.evaluation.tracking_distances
+
+
+@metric("effort", label="Mean actuator effort", over_path=True)
+def mean_effort(outcome: Outcome) -> np.ndarray:
+    """Return the mean size of the efforts over actuators and steps of each episode."""
+    return outcome.evaluation.efforts
+
+
+@metric(shown=PERCENT, label="Share of untrusted states", over_path=True)
+def untrusted_share(outcome: Outcome) -> np.ndarray | None:
+    """Return the share of the steps of each episode in which the surrogate does not trust itself."""
+    return outcome.evaluation.untrusted
+
+
+@metric("m3", source="body")
+def material_volume(model: MechanicalModel) -> float:
+    """Return the volume of the solid."""
+    return model.volume
