@@ -16,7 +16,7 @@ import numpy as np
 
 from softgym_envs.codesign.metrics.sources import EPISODES, SOURCES, Source
 from softgym_envs.errors import unknown_name
-from softgym_envs.registry import Registry, import_object
+from softgym_envs.registry import Table, import_object
 from softgym_envs.units import Display, display, effort_unit
 from softgym_envs.wording import decimal
 
@@ -189,13 +189,11 @@ def metric(
     return lambda function: Metric(function.__name__, function, unit, direction, source, **options)  # type: ignore[arg-type]
 
 
-class _Metrics(Registry):
-    """A registry whose entries are objects: metrics."""
-
-    def _checked(self, cls: object) -> Any:
-        if not isinstance(cls, Metric):
-            raise ValueError(f"a metric must be a Metric, got {cls!r}")
-        return cls
+class _Metrics(Table):
+    def _checked(self, found: Any) -> Metric:
+        if not isinstance(found, Metric):
+            raise ValueError(f"a metric must be a Metric, got {found!r}")
+        return found
 
 
 _MODULES = {
@@ -210,10 +208,9 @@ _MODULES = {
     "sensors": ("volume_change", "relative_volume_change", "cavity_volume", "pressure_sensitivity", "information"),
     "grasps": ("grip_force", "grip_resistance", "grip_energy"),
 }
-METRICS: Mapping[str, Metric] = _Metrics(  # type: ignore[assignment]
+METRICS: Mapping[str, Metric] = _Metrics(
     "metric",
     {name: f"softgym_envs.codesign.metrics.{module}:{name}" for module, names in _MODULES.items() for name in names},
-    base="softgym_envs.codesign.metrics.metric:Metric",
     group="softgym_envs.metrics",
 )
 """Registry: name to metric."""
