@@ -28,6 +28,7 @@ from softgym_envs.mechanics.frames import Frames
 from softgym_envs.mechanics.io import read_mesh
 from softgym_envs.mechanics.kinematics import Kinematics
 from softgym_envs.mechanics.materials import Material
+from softgym_envs.mechanics.mesh_checks import check_held
 from softgym_envs.mechanics.skins import Skin
 from softgym_envs.mechanics.solids import (
     MAX_BODY_SIZE,
@@ -109,7 +110,10 @@ class MechanicalModel:
         # Nodes without elements have no stiffness; holding them keeps the tangent regular.
         held |= ~used[:, None]
         self.kinematics = Kinematics(self.nodes, held, body_frames, held_spin)
+        if not self.kinematics.equations:
+            raise ValueError("every node is clamped, so that nothing can move; clamp only those where the body is held")
         self.floating = floating
+        self._is_held = floating
         self.solver = solver
         self.constraints: dict[str, list[Constraint]] = {"a": [], "e": [], "c": [], "s": [], "b": []}
         self.skins: list[Skin] = []
@@ -143,6 +147,7 @@ class MechanicalModel:
         gravity: Sequence[float] = (0.0, 0.0, 0.0),
         solver: str = "auto",
         max_size: float = MAX_BODY_SIZE,
+        check: bool = True,
     ) -> MechanicalModel:
         """Make a model of one material from any tetrahedral mesh.
 
@@ -163,6 +168,12 @@ class MechanicalModel:
             gravity: acceleration [m/s2], shape (3,).
             solver: name of the linear solver, see `make_solver`.
             max_size: largest allowed side of the body [m]; a longer one is rejected as a unit mistake.
+            check: refuse meshes that are not one body: repeated, folded or overlapping elements, nodes that are not
+                merged, and faces that lie on each other. False allows cuts of no width.
+
+        Raises:
+            ValueError: with the place and the remedy, for a mesh that is no body, clamps that do not hold it, or
+                wrong arguments.
         """
         part = solid_part(
             nodes,
@@ -176,10 +187,13 @@ class MechanicalModel:
             total_mass=total_mass,
             regions=regions,
             max_size=max_size,
+            check=check,
         )
         check_modulus(part.options["young_modulus"])
         block = part.kind(part.nodes, part.connectivity, **part.options)
-        return cls(part.nodes, [block], fixed=part.fixed, gravity=gravity, solver=solver)
+        model = cls(part.nodes, [block], fixed=part.fixed, gravity=gravity, solver=solver)
+        model._check_held()
+        return model
 
     @classmethod
     def from_file(
@@ -489,8 +503,19 @@ class MechanicalModel:
     def assembly(self) -> Assembly:
         """The equilibrium equations with the current constraints; adding a constraint creates a new assembly."""
         if self._assembly is None:
+            self._check_held()
             self._assembly = Assembly(self.nodes, self.kinematics, self.blocks, self.rows, self.constraints["b"])
         return self._assembly
+
+    def _check_held(self) -> None:
+        """Check once that clamps, frames and bonds leave no part of a solid loose; see `check_held`."""
+        if self._is_held:
+            return
+        held = self.kinematics.held.copy()
+        held[self.frames.carried] = True
+        ties = [(bond.dofs, bond.jacobian(self.nodes)) for bond in self.constraints["b"]]
+        check_held(self.nodes, held, [block.connectivity for block in self.solids], ties)
+        self._is_held = True
 
     @property
     def warping(self) -> Warping:

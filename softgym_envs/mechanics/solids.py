@@ -13,6 +13,7 @@ from softgym_envs.errors import unknown_name
 from softgym_envs.mechanics.elements.averaged import AveragedTetrahedra
 from softgym_envs.mechanics.elements.quadratic import EDGES, QuadraticTetrahedra, add_midside_nodes
 from softgym_envs.mechanics.elements.tetrahedra import SolidBlock, Tetrahedra, check_nodes
+from softgym_envs.mechanics.mesh_checks import check_mesh
 
 SOLIDS: dict[str, type[SolidBlock]] = {
     "linear": Tetrahedra,
@@ -65,6 +66,7 @@ def solid_part(
     total_mass: float | None = None,
     regions: Mapping[str, np.ndarray] | None = None,
     max_size: float = MAX_BODY_SIZE,
+    check: bool = True,
     **options: Any,
 ) -> SolidPart:
     """Prepare a solid body; see `MechanicalModel.from_mesh` for the arguments."""
@@ -72,6 +74,8 @@ def solid_part(
         raise ValueError(unknown_name("element", element, SOLIDS))
     nodes, tetrahedra = check_nodes(nodes), np.asarray(tetrahedra)
     check_size(nodes, max_size, "for nodes in millimetres pass 1e-3 * nodes")
+    if check:
+        check_mesh(nodes, tetrahedra[:, :4] if tetrahedra.ndim == 2 else tetrahedra)
     mask = fixed_mask(fixed(nodes) if callable(fixed) else fixed, len(nodes))
     if element == "quadratic" and tetrahedra.ndim == 2 and tetrahedra.shape[1] == 4:
         count = len(nodes)

@@ -170,8 +170,8 @@ def test_a_body_in_millimetres_is_rejected(tmp_path, mesh_in_millimetres, box):
         MechanicalModel.from_file(tmp_path / "beam.vtk", fixed_box=(-1, 1, -1, 30, -1, 30))
     nodes, tetrahedra = box((100.0, 20.0, 20.0))
     with pytest.raises(ValueError, match=message + r" \(for nodes in millimetres pass 1e-3 \* nodes\)"):
-        MechanicalModel.from_mesh(nodes, tetrahedra, fixed=[0])
-    large = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=[0], max_size=np.inf)
+        MechanicalModel.from_mesh(nodes, tetrahedra, fixed=lambda x: x[:, 0] < 1e-9)
+    large = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=lambda x: x[:, 0] < 1e-9, max_size=np.inf)
     assert large.volume == pytest.approx(4e4)
 
 
@@ -271,7 +271,7 @@ def test_the_element_kind_is_chosen_by_name(box):
         assert type(model.solids[0]) is kind
         np.testing.assert_array_equal(model.fixed, model.nodes[:, 0] == 0.0)  # midside nodes too
     with pytest.raises(ValueError, match="unknown element 'cubic'; allowed: linear, averaged, quadratic"):
-        MechanicalModel.from_mesh(nodes, tetrahedra, fixed=[0], element="cubic")
+        MechanicalModel.from_mesh(nodes, tetrahedra, fixed=lambda x: x[:, 0] < 1e-9, element="cubic")
 
 
 # -- surfaces -------------------------------------------------------------------------------------------------------
@@ -335,9 +335,8 @@ def test_a_finer_mesh_and_an_island_in_the_cavity(tmp_path):
     mesh = read_mesh(path, unit="mm", mesh_size=4e-3)
     volume = 60 * 20 * 20e-9 - 30 * 8 * 8e-9 + 10 * 4 * 4e-9
     assert Tetrahedra(mesh.nodes, mesh.tetrahedra).volume == pytest.approx(volume, rel=1e-9)
-    with pytest.raises(ValueError, match="the mesh has a part that is not connected to a fixed node"):
-        model = MechanicalModel.from_mesh(mesh.nodes, mesh.tetrahedra, fixed=lambda x: x[:, 0] < 1e-9)
-        Statics(model).solve([])
+    with pytest.raises(ValueError, match="a part of .* is not connected to anything that is held"):
+        MechanicalModel.from_mesh(mesh.nodes, mesh.tetrahedra, fixed=lambda x: x[:, 0] < 1e-9)
 
 
 def test_the_default_mesh_size_is_a_twentieth_of_the_diagonal(tmp_path):
@@ -372,7 +371,7 @@ def test_from_a_surface_to_the_condensed_model(hollow, element):
 
 def test_a_cavity_from_its_surface(hollow):
     nodes, tetrahedra = hollow.mesh.nodes, hollow.mesh.tetrahedra
-    model = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=[0])
+    model = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=lambda x: x[:, 0] < 1e-9)
     found = model.add_cavity("air", inside=[0.03, 0.01, 0.01])
     again = model.add_cavity("same", surface=found.triangles)
     assert again.rest_volume == found.rest_volume
@@ -380,7 +379,7 @@ def test_a_cavity_from_its_surface(hollow):
         model.add_cavity("air")
     with pytest.raises(ValueError, match="surface of cavity 'open' is not closed"):
         model.add_cavity("open", surface=found.triangles[1:])
-    quadratic = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=[0], element="quadratic")
+    quadratic = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=lambda x: x[:, 0] < 1e-9, element="quadratic")
     assert quadratic.add_cavity("air", surface=found.triangles).rest_volume == pytest.approx(found.rest_volume)
     with pytest.raises(ValueError, match="not joined by an edge of the quadratic elements"):
         corners = hollow.mesh.tetrahedra[[0, -1]].ravel()
@@ -388,12 +387,12 @@ def test_a_cavity_from_its_surface(hollow):
 
 
 def test_a_point_in_the_material_or_outside_is_in_no_cavity(hollow, box):
-    model = MechanicalModel.from_mesh(hollow.mesh.nodes, hollow.mesh.tetrahedra, fixed=[0])
+    model = MechanicalModel.from_mesh(hollow.mesh.nodes, hollow.mesh.tetrahedra, fixed=lambda x: x[:, 0] < 1e-9)
     for point in ([0.01, 0.01, 0.01], [0.03, 0.01, 0.03]):
         with pytest.raises(ValueError, match=r"no closed cavity .* for 'air'; its cavities lie around \[\[0.03"):
             model.add_cavity("air", inside=point)
     nodes, tetrahedra = box((0.1, 0.02, 0.02))
-    solid = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=[0])
+    solid = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=lambda x: x[:, 0] < 1e-9)
     with pytest.raises(ValueError, match="it has none, or they are open to the outside"):
         solid.add_cavity("air", inside=[0.05, 0.01, 0.01])
 

@@ -139,7 +139,7 @@ def test_elasticity_may_differ_per_element_and_change(box):
 def test_weight_is_density_times_volume_times_gravity(box):
     nodes, tetrahedra = box((0.3, 0.2, 0.1), (3, 2, 2), 0.2)
     gravity = np.array([1.0, 2.0, -9.81])
-    model = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=[0], density=1234.0, gravity=gravity)
+    model = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=nodes[:, 0] < 1e-9, density=1234.0, gravity=gravity)
     assert model.volume == pytest.approx(0.3 * 0.2 * 0.1, rel=1e-12)
     assert model.mass == pytest.approx(1234.0 * 0.006, rel=1e-12)
     np.testing.assert_allclose(model.loads.sum(axis=0), 1234.0 * 0.006 * gravity, rtol=1e-12)
@@ -198,7 +198,7 @@ def test_negatively_oriented_elements_are_reoriented(box):
     nodes, tetrahedra = box((1, 1, 1), (2, 2, 2))
     mirrored = tetrahedra.copy()
     mirrored[::3] = mirrored[::3][:, [1, 0, 2, 3]]
-    plain, turned = (MechanicalModel.from_mesh(nodes, t, fixed=[0]) for t in (tetrahedra, mirrored))
+    plain, turned = (MechanicalModel.from_mesh(nodes, t, fixed=nodes[:, 0] < 1e-9) for t in (tetrahedra, mirrored))
     assert turned.volume == pytest.approx(1.0, rel=1e-12)
     corners = nodes[turned.blocks[0].connectivity]
     assert (np.linalg.det(corners[:, 1:] - corners[:, :1]) > 0.0).all()

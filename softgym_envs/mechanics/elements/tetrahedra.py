@@ -14,6 +14,9 @@ from softgym_envs.mechanics.elements.block import ElementBlock, StrainRates, low
 from softgym_envs.mechanics.elements.damping import resist, strain_rates
 from softgym_envs.mechanics.materials import Material, lame_parameters, resolve_material
 
+FACES = np.array([(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)])
+"""Corners of the faces of a positively oriented tetrahedron, seen counter-clockwise from outside."""
+
 
 @njit(cache=True, error_model="numpy")
 def deformation_gradients(x, connectivity, points, gradients, F):
@@ -179,7 +182,8 @@ def orient_corners(nodes: np.ndarray, connectivity: np.ndarray) -> tuple[np.ndar
     connectivity[turned] = connectivity[turned][:, [0, 2, 1, 3]]
     flat = np.flatnonzero(np.abs(volumes) < 1e-9 * np.abs(edges).max(axis=(1, 2)) ** 3)
     if len(flat):
-        raise ValueError(f"{len(flat)} degenerate tetrahedra, the first at index {flat[0]}")
+        place = [float(f"{value:.4g}") for value in corners[flat[0]].mean(axis=0)]
+        raise ValueError(f"{len(flat)} degenerate tetrahedra, the first at index {flat[0]} near {place} m")
     return connectivity, np.abs(volumes), turned
 
 
@@ -204,7 +208,7 @@ def boundary_triangles(tetrahedra: np.ndarray) -> np.ndarray:
     Args:
         tetrahedra: corner indices of positively oriented tetrahedra, shape (m, 4).
     """
-    faces = tetrahedra[:, [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]].reshape(-1, 3)
+    faces = tetrahedra[:, FACES].reshape(-1, 3)
     _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
     return faces[np.sort(first[count == 1])]
 
