@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from softgym_envs.mechanics.contact.obstacles import Sphere as Sphere
     from softgym_envs.mechanics.elements.beams import Section as Section
     from softgym_envs.mechanics.io import read_mesh as read_mesh
+    from softgym_envs.mechanics.mesh_checks import merge_nodes as merge_nodes
     from softgym_envs.mechanics.model import MechanicalModel as MechanicalModel
     from softgym_envs.mechanics.solvers.dynamics import Dynamics as Dynamics
     from softgym_envs.mechanics.solvers.statics import Statics as Statics
@@ -36,6 +37,7 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "contact.obstacles": ["Cylinder", "MeshObstacle", "Plane", "RoundedPrism", "Sphere"],
         "elements.beams": ["Section"],
         "io": ["read_mesh"],
+        "mesh_checks": ["merge_nodes"],
         "model": ["MechanicalModel"],
         "solvers.dynamics": ["Dynamics"],
         "solvers.statics": ["Statics"],
