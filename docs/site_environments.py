@@ -8,11 +8,12 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from site_robots import MOVES, design_table, groups_of, robot_of
+from site_robots import MOVES, design_table, groups_of, has_surrogate, robot_of
 from site_writing import code, options_of, page_name, picture, quantity, span, table
 
 import softgym_envs  # noqa: F401 - registers the environments
 from softgym_envs import ENVIRONMENTS
+from softgym_envs.agents.config import EnvironmentConfig
 from softgym_envs.backends.registry import BACKENDS
 from softgym_envs.envs import SoftRobotEnv, Task
 from softgym_envs.envs.options import EnvironmentOptions
@@ -25,6 +26,22 @@ from softgym_envs.units import effort_unit
 def observation_scales(robot: Robot) -> dict[str, float]:
     """Scales of positions, errors [m] and speeds [m/s] in the observation (a test compares them with the real one)."""
     return {"position": 1.25 * robot.size, "error": robot.workspace_scale / 2.5, "speed": robot.size}
+
+
+def surrogate_and_batches(identifier: str) -> str:
+    """Whether a surrogate ships for the robot of an ID, and how ``gymnasium.make_vec`` steps many environments."""
+    row = ENVIRONMENTS[identifier]
+    config = EnvironmentConfig(id=identifier)
+    learned = has_surrogate(row.robot, tuple(sorted(row.robot_options.items())))
+    default = f"The default backend is `{config.backend!r}`".replace("'", '"')
+    other = "" if config.backend == "surrogate" else '; `backend="surrogate"` works too'
+    first = f"{default}{other}." if learned else f"{default}: no surrogate ships for this robot."
+    how = (
+        "steps all environments in one call (same-step autoreset)"
+        if config.batched
+        else "steps each environment in a process of its own"
+    )
+    return f'{first} `gymnasium.make_vec("{identifier}", num_envs=...)` {how}.'
 
 
 def environment_sections(identifier: str) -> dict[str, Callable[[], str]]:
@@ -146,7 +163,7 @@ def environment_sections(identifier: str) -> dict[str, Callable[[], str]]:
             return rest + (
                 f"The goal is at the first of the {len(path)} points of the path, which are spread over "
                 f'{task.horizon} steps. `task_options={{"path": array}}` gives another path [m], shape (p, 3); '
-                '`task_options={"jitter": 0.005}` shifts it randomly by up to 5 mm along each axis in each episode; '
+                '`task_options={"jitter": 0.005}` shifts it randomly by up to 5 mm along each axis in each episode. '
                 "The observation shows the goal that the next action is rated by; "
                 '`task_options={"lookahead": 0}` shows the one before; '
                 '`reset(options={"goal": array})` gives the path of one episode.'
@@ -192,16 +209,7 @@ def environment_sections(identifier: str) -> dict[str, Callable[[], str]]:
             if options:
                 parts.append(f"`{argument}`, {kind}:\n\n{table(['option', 'default', 'meaning'], options)}")
         parts.append(f"Design variables, in SI:\n\n{design_table(robot)}")
-        if fixed["backend"] == "surrogate":
-            parts.append(
-                f'`gymnasium.make_vec("{identifier}", num_envs=1024)` gives the natively batched environment on the '
-                "surrogate (same-step autoreset)."
-            )
-        else:
-            parts.append(
-                "No surrogate ships for this robot: the default backend is FEM. "
-                f'`gymnasium.make_vec("{identifier}", ...)` steps each environment in a process of its own.'
-            )
+        parts.append(surrogate_and_batches(identifier))
         return "\n\n".join(parts)
 
     return {

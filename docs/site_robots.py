@@ -12,12 +12,13 @@ from typing import Any
 from site_writing import code, environment_pages, first_sentence, number, options_of, quantity, span, summary, table
 
 from softgym_envs import make_robot
+from softgym_envs.backends import make_backend
 from softgym_envs.envs.registration import ENVIRONMENTS
+from softgym_envs.errors import WeightsError
 from softgym_envs.mechanics.elements.beams import Beam
 from softgym_envs.mechanics.elements.block import ElementBlock
 from softgym_envs.mechanics.elements.tetrahedra import SolidBlock
 from softgym_envs.robots import ROBOTS, Actuator, Robot
-from softgym_envs.surrogate.pretrained import pretrained_folder
 from softgym_envs.units import effort_unit
 
 MOVES = {
@@ -115,6 +116,16 @@ def point(values: Iterable[float]) -> str:
     return f"({', '.join(number(round(1e3 * float(v), 6)) for v in values)}) mm"
 
 
+@cache
+def has_surrogate(name: str, options: tuple[tuple[str, Any], ...] = ()) -> bool:
+    """Whether environments of a robot run on a surrogate: by making its backend."""
+    try:
+        make_backend("surrogate", robot_of(name, options))
+    except (WeightsError, ValueError):  # none ships, or it does not suffice without the rest of a gripper
+        return False
+    return True
+
+
 def robot_sections(name: str) -> dict[str, Callable[[], str]]:
     """Template of a robot's page."""
     robot = robot_of(name)
@@ -126,9 +137,9 @@ def robot_sections(name: str) -> dict[str, Callable[[], str]]:
         return facts + text
 
     def weights() -> str:
-        if pretrained_folder(robot).is_dir():
+        if has_surrogate(name):
             return f"Weights of a surrogate ship for the default options (`{robot.weights_name}`)."
-        return "No surrogate ships for the default options: environments run on FEM; `softgym fit` makes one."
+        return "With the default options no surrogate ships that environments run on: they run on finite elements."
 
     def environments() -> str:
         rows = [

@@ -18,6 +18,8 @@ from softgym_envs.config import check_config
 from softgym_envs.envs.options import EnvironmentOptions
 from softgym_envs.envs.registration import ENVIRONMENTS
 from softgym_envs.envs.spaces import AgentSpaces
+from softgym_envs.envs.vector_env import SoftRobotVectorEnv
+from softgym_envs.errors import WeightsError
 from softgym_envs.robots import ROBOTS
 from softgym_envs.surrogate.training import FitConfig
 from tests.accessibility import defects
@@ -106,6 +108,22 @@ def test_the_printed_size_of_the_observation_is_the_real_one(identifier):
     env = gymnasium.make(identifier)
     assert f"({env.observation_space.shape[0]} + k,)" in environments.environment_top(identifier)
     env.close()
+
+
+@pytest.mark.parametrize("identifier", ENVIRONMENTS)
+def test_pages_say_whether_a_surrogate_ships_and_how_many_environments_are_stepped(identifier):
+    import gymnasium
+
+    text = environments.surrogate_and_batches(identifier)
+    try:
+        gymnasium.make(identifier, backend="surrogate").close()
+    except WeightsError:
+        assert "no surrogate ships" in text
+    else:
+        assert "no surrogate ships" not in text
+    envs = gymnasium.make_vec(identifier, num_envs=1)
+    assert ("in one call" in text) == isinstance(envs, SoftRobotVectorEnv)
+    envs.close()
 
 
 @pytest.mark.parametrize("package", api.PACKAGES)
