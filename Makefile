@@ -85,7 +85,7 @@ test-programs:
 	has_chromium || echo "setup: without Chromium, tests of reports in a browser are skipped; install (Debian name): chromium" >&2
 
 demo: setup
-	$(BIN)/softgym codesign --config configs/codesign/finger_reach.yaml --folder $(DEMO)
+	$(BIN)/softgym demo --folder $(DEMO)
 
 # One thread per process: the matrices are small, and the test workers occupy the cores.
 check test slow-tests bench docs docs-images: export OMP_NUM_THREADS = 1

@@ -78,3 +78,13 @@ def test_workflows_name_the_system_packages_that_errors_name():
     for name in ("ci", "release"):
         words = set((ROOT / ".github" / "workflows" / f"{name}.yml").read_text().split())
         assert set(extras.SYSTEM_PACKAGES.split()) <= words
+
+
+def test_the_demonstration_is_the_shipped_study(softgym, monkeypatch, tmp_path):
+    runs = []
+    monkeypatch.setattr("softgym_envs.codesign.study.run_study", lambda *args, **options: runs.append((args, options)))
+    monkeypatch.setattr("softgym_envs.codesign.report.page.write_report", lambda folder: folder / "report.html")
+    status, out, _ = softgym("demo", "--folder", tmp_path, "--workers", "1", "--quiet")
+    assert (status, out) == (0, f"report: {tmp_path / 'report.html'}\n")
+    (((config, folder), options),) = runs
+    assert (config.name, folder, options["workers"]) == ("finger_reach", tmp_path, 1)

@@ -40,6 +40,7 @@ SECTIONS = {
         "deploy-policy": "agents:deploy_policy",
     },
     "Design and control": {
+        "demo": "demo:demo",
         "codesign": "codesign:codesign",
         "optimise": "codesign:optimise",
         "sensitivity": "codesign:sensitivity",
