@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from softgym_envs.mechanics.elements.beams import Beam, Section
 from softgym_envs.mechanics.elements.block import ElementBlock
@@ -14,6 +15,8 @@ from softgym_envs.mechanics.elements.rigid import RigidBody
 from softgym_envs.mechanics.elements.superelement import PortEnergy, Superelement
 from softgym_envs.mechanics.frames import frame_rows
 from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.mechanics.rods import ENDS, Rod, outlines, straight_places, transported_frames
+from softgym_envs.mechanics.skins import tube_skin
 from softgym_envs.mechanics.solids import Fixed, are_rows, described, solid_part
 
 
@@ -39,6 +42,7 @@ class ModelBuilder:
         self._carried: dict[int, np.ndarray] = {}
         self._mounted: dict[int, list[int]] = {}
         self._parts: list[tuple[type[ElementBlock], np.ndarray, dict[str, object]]] = []
+        self._rods: list[tuple[int, np.ndarray, np.ndarray | None]] = []  # part, places of frames, outlines
         self.size = 0
 
     def _append(self, rows: np.ndarray, fixed: np.ndarray) -> int:
@@ -122,6 +126,57 @@ class ModelBuilder:
             )
         self._parts.append((Beam, np.asarray(frames, dtype=np.int64), {"section": section, **options}))
 
+    def add_rod(
+        self,
+        path: ArrayLike,
+        *,
+        section: Section | Callable[[float], Section],
+        elements: int | Sequence[float] | np.ndarray = 10,
+        order: int = 2,
+        up: ArrayLike | None = None,
+        held: str = "start",
+        **options: Any,
+    ) -> list[int]:
+        """Add a rod: beam elements along a line, with the surface of its sections. It is the next of the model's `rods`.
+
+        Args:
+            path: both ends of a straight rod [m], shape (2, 3), or all frames of a curved one, shape (c, 3). The rod is
+                free of stress in this shape.
+            section: of all elements, or a function of the place along the rod [m] that returns that of the element with
+                its middle there.
+            elements: of a straight rod: a number of equal ones, or their ends along the rod [m], e.g. at its discs.
+            order: 1 or 2, see `Beam`; with 2 every second frame is the middle of an element.
+            up: direction of d_2 at the start; default: the axis of space that is least along the rod.
+            held: which ends are clamped: ``"start"``, ``"both"`` or ``"none"``.
+            **options: ``young_modulus`` and others of `Beam`.
+
+        Returns:
+            First rows of its frames.
+
+        Raises:
+            ValueError: for a path or elements that describe no rod.
+        """
+        points = np.asarray(path, dtype=float)
+        if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2 or not np.isfinite(points).all():
+            raise ValueError(f"the path of a rod must be two or more points [m] of three finite numbers, got {path!r}")
+        if held not in ENDS:
+            raise ValueError(f"held = {held!r} is unknown; allowed: {', '.join(ENDS)}")
+        if len(points) == 2:
+            places = straight_places(float(np.linalg.norm(points[1] - points[0])), elements, order)
+            points = points[0] + (places / places[-1])[:, None] * (points[1] - points[0])
+        else:
+            places = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+        clamped = np.isin(np.arange(len(points)), np.array(ENDS[held], dtype=int) % len(points))
+        frames = [
+            self.add_frame(point, rotation, fixed=bool(fix), fixed_spin=bool(fix))
+            for point, rotation, fix in zip(points, transported_frames(points, up), clamped, strict=True)
+        ]
+        middles = 0.5 * (places[:-order:order] + places[order::order])
+        sections = section if isinstance(section, Section) else [section(float(s)) for s in middles]
+        self.add_beam(frames, section=sections, order=order, **options)
+        self._rods.append((len(self._parts) - 1, places, outlines(section, places)))
+        return frames
+
     def add_superelement(
         self, near: int, far: int, energy: PortEnergy, *, cavity: PortVolume | None = None, **options: Any
     ) -> None:
@@ -147,7 +202,7 @@ class ModelBuilder:
         """Return the model, with its blocks in the order in which they were added."""
         nodes = self.nodes
         blocks = [kind(nodes, topology, **options) for kind, topology, options in self._parts]  # type: ignore[call-arg]
-        return MechanicalModel(
+        model = MechanicalModel(
             nodes,
             blocks,
             fixed=np.vstack(self._fixed),
@@ -159,3 +214,10 @@ class ModelBuilder:
             gravity=self._gravity,
             solver=self._solver,
         )
+        for part, places, outline in self._rods:
+            beam = blocks[part]
+            assert isinstance(beam, Beam)
+            model.rods.append(Rod(beam, places))
+            if outline is not None:
+                model.skins.append(tube_skin(beam, nodes, outline))
+        return model

@@ -27,8 +27,10 @@ from softgym_envs.mechanics.elements.tetrahedra import SolidBlock, check_nodes
 from softgym_envs.mechanics.frames import Frames
 from softgym_envs.mechanics.io import read_mesh
 from softgym_envs.mechanics.kinematics import Kinematics
+from softgym_envs.mechanics.loads import Load, spread
 from softgym_envs.mechanics.materials import Material
 from softgym_envs.mechanics.mesh_checks import check_held
+from softgym_envs.mechanics.rods import Rod
 from softgym_envs.mechanics.skins import Skin
 from softgym_envs.mechanics.solids import (
     MAX_BODY_SIZE,
@@ -73,6 +75,8 @@ class MechanicalModel:
             ``"s"`` sensors (measured, never loaded), ``"b"`` bonds (held at zero, not part of the condensed model).
         nodal_loads: dead loads on the rows besides gravity [N], shape (n, 3); change them in place.
         skins: surfaces of beams and rigid parts, for pictures and contact.
+        rods: beams along a line, from `ModelBuilder.add_rod` or `from_rod`.
+        named_loads: loads from `add_load` by name.
         contact: what the surface of the body touches, or None; see `set_contact`.
         kinematics: degrees of freedom, and the motions that belong to them.
         solver: name of the linear solver.
@@ -117,6 +121,8 @@ class MechanicalModel:
         self.solver = solver
         self.constraints: dict[str, list[Constraint]] = {"a": [], "e": [], "c": [], "s": [], "b": []}
         self.skins: list[Skin] = []
+        self.rods: list[Rod] = []
+        self.named_loads: dict[str, Load] = {}
         self.contact: Contact | None = None
         self.nodal_loads = np.zeros_like(self.nodes)
         self._gravity_forces = np.zeros_like(self.nodes)
@@ -234,6 +240,17 @@ class MechanicalModel:
         assert fixed is not None
         return cls.from_mesh(mesh.nodes, mesh.tetrahedra, fixed=fixed, regions=mesh.regions, **options)
 
+    @classmethod
+    def from_rod(
+        cls, path: ArrayLike, *, gravity: Sequence[float] = (0.0, 0.0, 0.0), solver: str = "auto", **options: Any
+    ) -> MechanicalModel:
+        """Make a model of one rod; path and options as for `ModelBuilder.add_rod`."""
+        from softgym_envs.mechanics.builder import ModelBuilder
+
+        builder = ModelBuilder(gravity=gravity, solver=solver)
+        builder.add_rod(path, **options)
+        return builder.build()
+
     @property
     def solids(self) -> list[SolidBlock]:
         """The blocks of solid elements."""
@@ -321,6 +338,41 @@ class MechanicalModel:
         self.add("a", cable)
         return cable
 
+    def add_tendon(
+        self,
+        name: str,
+        places: ArrayLike,
+        offsets: ArrayLike,
+        *,
+        rod: int = 0,
+        pull_point: ArrayLike | None = None,
+        unilateral: bool = True,
+        compliance: float = 0.0,
+    ) -> Cable:
+        """Add a tendon along a rod: a cable that runs straight from disc to disc, without friction unless it is set.
+
+        Args:
+            name: identifier.
+            places: of the discs that guide it, along the rod at rest from the base to the anchor [m], shape (p,).
+            offsets: of the tendon along d_2 and d_3 in each disc [m], shape (2,) or (p, 2).
+            rod: its number among `rods`.
+            pull_point: fixed point where the tendon leaves [m], shape (3,); default: beside the start of the rod, with
+                the offset of the first disc.
+            unilateral: True for a real tendon, which cannot push.
+            compliance: how far it stretches per tension [m/N], see `Cable`.
+
+        Raises:
+            ValueError: for a disc that is not on the rod.
+        """
+        line = self.rods[rod]
+        through = np.broadcast_to(np.asarray(offsets, dtype=float), (np.size(places), 2))
+        if pull_point is None:
+            pull_point = line.points(0.0, through[0], self.nodes).points[0]
+        embedding = line.points(places, through, self.nodes)
+        tendon = Cable(name, embedding, np.asarray(pull_point), unilateral=unilateral, compliance=compliance)
+        self.add("a", tendon)
+        return tendon
+
     def add_cavity(
         self,
         name: str,
@@ -387,10 +439,15 @@ class MechanicalModel:
         return air
 
     def add_effector(
-        self, name: str, point: ArrayLike, *, hint: np.ndarray | None = None, block: int = 0, radius: float = 0.0
+        self, name: str, point: ArrayLike | EmbeddedPoints, *, hint: np.ndarray | None = None, block: int = 0, radius: float = 0.0
     ) -> Point:
-        """Add an effector at a material point [m] (3,) of a solid, or averaged over a radius [m] (see `embed`)."""
-        effector = Point(name, self.embed(point, hint, block=block, name=f"effector '{name}'", radius=radius))
+        """Add an effector at a material point [m] (3,) of a solid, or averaged over a radius [m] (see `embed`).
+
+        Or at a point that is embedded already, as one of a rod (`Rod.points`).
+        """
+        if not isinstance(point, EmbeddedPoints):
+            point = self.embed(point, hint, block=block, name=f"effector '{name}'", radius=radius)
+        effector = Point(name, point)
         self.add("e", effector)
         return effector
 
@@ -448,6 +505,27 @@ class MechanicalModel:
         if acceleration.any():
             for block in self.blocks:
                 self._gravity_forces += block.nodal_masses(len(self.nodes))[:, None] * acceleration
+
+    def add_load(self, name: str, force: ArrayLike, on: EmbeddedPoints | Rod | Fixed) -> None:
+        """Add a force that keeps its direction, or change one of the same name.
+
+        Args:
+            name: identifier.
+            force: the whole of it [N], shape (3,).
+            on: what carries it: embedded points in equal parts, a rod evenly along its length, or the nodes of a
+                straight edge (a mask, indices, or a function of the nodes that returns one) in proportion to it.
+
+        Raises:
+            ValueError: if the force is not three finite numbers, or acts on no node or on no straight edge.
+        """
+        total = np.asarray(force, dtype=float)
+        if total.shape != (3,) or not np.isfinite(total).all():
+            raise ValueError(f"the force of load '{name}' must be three finite numbers [N], got {force!r}")
+        load = Load(total, *spread(name, on, self.nodes))
+        if name in self.named_loads:
+            self.named_loads[name].add_to(self.nodal_loads, -1.0)
+        load.add_to(self.nodal_loads)
+        self.named_loads[name] = load
 
     @property
     def loads(self) -> np.ndarray:

@@ -88,16 +88,26 @@ class Cable(Constraint):
         embedding: the points in order from the pull point to the anchor.
         pull_point: fixed point where the cable leaves the body [m], shape (3,).
         unilateral: True for a real cable, which cannot push; False lets it push, as in some published models.
+        compliance: how far the cable stretches per tension [m/N], see `Constraint`; its length over EA.
 
     Raises:
-        ValueError: if two successive points coincide.
+        ValueError: if two successive points coincide, or for a negative compliance.
     """
 
     size = 1
 
     def __init__(
-        self, name: str, embedding: EmbeddedPoints, pull_point: np.ndarray, *, unilateral: bool = True
+        self,
+        name: str,
+        embedding: EmbeddedPoints,
+        pull_point: np.ndarray,
+        *,
+        unilateral: bool = True,
+        compliance: float = 0.0,
     ) -> None:
+        if not 0.0 <= compliance < np.inf:
+            raise ValueError(f"compliance = {compliance} m/N of cable '{name}' must be finite and not negative")
+        self.compliance = compliance
         self.name = name
         self.embedding = embedding
         self.pull_point = np.asarray(pull_point, dtype=float)

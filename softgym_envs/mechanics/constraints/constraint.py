@@ -20,6 +20,8 @@ class Constraint(ABC):
         dofs: degrees of freedom of the full node array (3 * node + axis) it depends on, shape (k,).
         unilateral: whether the effort must not be negative when displacement-driven (a cable cannot push).
         unit: units of displacement and effort, for tables.
+        compliance: how far what drives it stretches per effort [m/N]: driven in displacement, a command is what the far
+            end does, and delta stays behind by ``compliance * effort``. Statics only.
     """
 
     name: str
@@ -27,6 +29,7 @@ class Constraint(ABC):
     dofs: np.ndarray
     unilateral: bool = False
     unit: tuple[str, str] = ("m", "N")
+    compliance: float = 0.0
 
     def rows(self) -> list[Row]:
         """Names and units of its rows."""

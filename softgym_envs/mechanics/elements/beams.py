@@ -35,6 +35,7 @@ class Section:
         torsion: torsion constant [m4].
         shear: shear correction factors along d_2 and d_3.
         mass_area: area that has mass [m2], if it is larger than ``area``.
+        outline: corners [m] along d_2 and d_3, counter-clockwise, of the surface that is drawn; not used by mechanics.
     """
 
     area: float
@@ -42,6 +43,7 @@ class Section:
     torsion: float
     shear: tuple[float, float] = (1.0, 1.0)
     mass_area: float | None = None
+    outline: tuple[tuple[float, float], ...] = ()
 
     def __post_init__(self) -> None:
         values = (self.area, *self.inertia, self.torsion, *self.shear, self.material_area)
@@ -63,7 +65,10 @@ class Section:
         k = np.arange(1, 40, 2)
         series = float((np.tanh(k * np.pi * long / (2.0 * short)) / k**5).sum())
         torsion = long * short**3 / 3.0 * (1.0 - 192.0 * short / (np.pi**5 * long) * series)
-        return cls(area, (width * thickness**3 / 12.0, thickness * width**3 / 12.0), torsion, (5.0 / 6.0, 5.0 / 6.0))
+        x, y = 0.5 * width, 0.5 * thickness
+        corners = ((x, y), (-x, y), (-x, -y), (x, -y))
+        inertia = width * thickness**3 / 12.0, thickness * width**3 / 12.0
+        return cls(area, inertia, torsion, (5.0 / 6.0, 5.0 / 6.0), outline=corners)
 
     @classmethod
     def circle(cls, radius: float, inner: float = 0.0) -> Section:
@@ -73,7 +78,9 @@ class Section:
         area = np.pi * (radius**2 - inner**2)
         inertia = 0.25 * np.pi * (radius**4 - inner**4)
         shear = 0.9 if inner == 0.0 else 0.5
-        return cls(area, (inertia, inertia), 2.0 * inertia, (shear, shear))
+        turns = 2.0 * np.pi * np.arange(24) / 24
+        corners = tuple((float(radius * np.cos(turn)), float(radius * np.sin(turn))) for turn in turns)
+        return cls(area, (inertia, inertia), 2.0 * inertia, (shear, shear), outline=corners)
 
     def stiffness(self, young_modulus: float, poisson_ratio: float) -> np.ndarray:
         """Diagonal stiffness (6,): EA, GA_2, GA_3 [N], GJ, EI_2, EI_3 [N m2]."""
@@ -308,7 +315,7 @@ class Beam(ElementBlock):
         self.order = order
         self.rows = chain[order * np.arange(m)[:, None] + np.arange(order + 1)]
         points, gauss = np.polynomial.legendre.leggauss(order)
-        self.shape, local = _lagrange(order, points)
+        self.shape, local = lagrange(order, points)
         sections = [section] * m if isinstance(section, Section) else list(section)
         if len(sections) != m:
             raise ValueError(f"the beam has {m} elements, got {len(sections)} sections")
@@ -441,7 +448,7 @@ class Beam(ElementBlock):
     def mass_entries(self, lumped: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         # Kinetic energy of a cross-section per unit length: rho / 2 (A |p'|^2 + I_3 |d_2'|^2 + I_2 |d_3'|^2).
         points, gauss = np.polynomial.legendre.leggauss(self.order + 1)
-        shape, _ = _lagrange(self.order, points)
+        shape, _ = lagrange(self.order, points)
         shares = 0.5 * np.einsum("q,qa,qb->ab", gauss, shape, shape)
         parts = []
         for row, values in (
@@ -473,7 +480,7 @@ class Beam(ElementBlock):
         return EmbeddedPoints.from_weights(np.array(ids), np.array(weights), nodes)
 
 
-def _lagrange(order: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def lagrange(order: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Shape functions and their slopes at points of [-1, 1], each (q, order + 1), for equally spaced nodes."""
     t = points[:, None]
     if order == 1:

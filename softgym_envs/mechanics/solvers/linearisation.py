@@ -90,15 +90,16 @@ class Linearisation:
         """Whether the factorised tangent is exact and positive definite."""
         return self.exact and self._tangent.solver.positive_definite
 
-    def buckling(self, rows: np.ndarray) -> int:
+    def buckling(self, rows: np.ndarray, compliance: np.ndarray) -> int:
         """Return how many negative eigenvalues ``W`` has in rows that carry efforts; 0 where contact may hold the body.
 
-        The body would buckle if these efforts were given. It is stable with the rows held in place if its tangent has
-        as many.
+        The body would buckle if these efforts were given. It is stable with the rows held in place, by drives of a
+        ``compliance`` (size,), if its tangent has as many.
         """
         if self.contact is not None:
             return 0
-        return int((np.linalg.eigvalsh(self.W[rows[:, None], rows]) < 0.0).sum())
+        held = self.W[rows[:, None], rows] + np.diag(compliance[rows])
+        return int((np.linalg.eigvalsh(held) < 0.0).sum())
 
     @property
     def negative_eigenvalues(self) -> int:

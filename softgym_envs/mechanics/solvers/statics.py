@@ -66,6 +66,7 @@ class Statics:
         x: current node positions [m], shape (n, 3).
         effort: current efforts of all rows, shape (size,).
         unilateral: actuator rows that cannot push, shape (n_a,); may be changed between solves.
+        compliance: of the drives of all rows, shape (size,), see `Constraint`; may be changed between solves.
         linearisation: the equations linearised where the last iteration ended.
     """
 
@@ -92,6 +93,9 @@ class Statics:
         self._contacts = self._actuators + sizes.get("e", 0) + np.arange(sizes.get("c", 0))
         self._bonds = self._assembly.size - sizes.get("b", 0) + np.arange(sizes.get("b", 0))
         self.unilateral = np.array([c.unilateral for c in model.constraints["a"] for _ in range(c.size)], dtype=bool)
+        self.compliance = np.concatenate([np.zeros(0), *(np.full(c.size, c.compliance) for c, _ in model.rows)])
+        if self.compliance.any() and model.contact is not None:
+            raise ValueError("drives with compliance are computed without contact only; allowed: compliance = 0")
         self._elasticity_version = model.elasticity_version
         self._layout = RowLayout.of(model)
         self._compiled, self._lumped = compiled, False
@@ -172,8 +176,8 @@ class Statics:
         step_effort[forced] = target[forced] - effort[forced]
         if len(driven):
             shift = linear.shift if Ar is None else Ar @ linear.H
-            gap = (delta - target - shift + linear.W @ step_effort)[driven]
-            W = linear.W[driven[:, None], driven]
+            gap = (delta + self.compliance * effort - target - shift + linear.W @ step_effort)[driven]
+            W = linear.W[driven[:, None], driven] + np.diag(self.compliance[driven])
             unilateral = np.zeros(len(effort), dtype=bool)
             unilateral[: self._actuators] = self.unilateral
             step = held_step if self._buckling(driven, effort) else complementary_step
@@ -193,7 +197,7 @@ class Statics:
         if self.linearisation.positive_definite or not self.unilateral.any():
             return 0
         slack = np.flatnonzero(self.unilateral & (effort[: self._actuators] <= 0.0))
-        return self.linearisation.buckling(np.setdiff1d(driven, slack))
+        return self.linearisation.buckling(np.setdiff1d(driven, slack), self.compliance)
 
     def _norm(self, step: np.ndarray) -> float:
         """Largest displacement [m] of a step of the equations."""
@@ -470,7 +474,7 @@ class Statics:
 
         # Commands are ramped from the current values.
         start = self.effort.copy()
-        start[driven] = linear.delta[driven]
+        start[driven] = (linear.delta + self.compliance * start)[driven]
         done, size, iterations, increments = 0.0, 1.0, 0, 0
         while done < 1.0:
             level = min(1.0, done + size)

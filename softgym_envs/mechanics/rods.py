@@ -1,0 +1,122 @@
+"""Slender rods: beam elements along a line, with their surface, material points and guides of tendons."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
+from softgym_envs.mechanics.elements.beams import Beam, Section, lagrange
+
+ENDS = {"none": (), "start": (0,), "both": (0, -1)}
+"""Which frames of a rod are clamped, by name."""
+
+
+@dataclass(frozen=True)
+class Rod:
+    """A chain of beam elements whose frames are known by their place along it.
+
+    Attributes:
+        beam: the elements.
+        places: of its frames along the rod at rest [m], from zero, shape (c,).
+    """
+
+    beam: Beam
+    places: np.ndarray
+
+    @property
+    def length(self) -> float:
+        """Length at rest [m]."""
+        return float(self.places[-1])
+
+    def points(self, places: ArrayLike, offsets: ArrayLike, nodes: np.ndarray) -> EmbeddedPoints:
+        """Return points that are fixed to cross-sections.
+
+        Between frames the directors are interpolated, so a point lies a little closer to the axis of a bent rod there:
+        put frames where points matter.
+
+        Args:
+            places: along the rod at rest [m], shape (p,) or a number.
+            offsets: along d_2 and d_3 [m], or along all three directors, shape (2,), (3,), (p, 2) or (p, 3).
+            nodes: rest rows [m], shape (n, 3).
+
+        Raises:
+            ValueError: for a place that is not on the rod.
+        """
+        s = np.atleast_1d(np.asarray(places, dtype=float))
+        slack = 1e-9 * self.length
+        outside = ~((s >= -slack) & (s <= self.length + slack))
+        if outside.any():
+            raise ValueError(f"place {s[outside][0]:g} m is not on the rod; allowed: 0 to {self.length:g} m")
+        local = np.asarray(offsets, dtype=float)
+        if local.shape[-1] == 2:
+            local = np.concatenate([np.zeros((*local.shape[:-1], 1)), local], axis=-1)
+        factors = np.column_stack([np.ones(len(s)), np.broadcast_to(local, (len(s), 3))])
+        nearest = np.abs(s[:, None] - self.places).argmin(axis=1)
+        if (np.abs(s - self.places[nearest]) <= slack).all():
+            return EmbeddedPoints.from_weights(self.beam.chain[nearest][:, None] + np.arange(4), factors, nodes)
+        order = self.beam.order
+        ends = self.places[::order]
+        element = np.clip(np.searchsorted(ends, s, side="right") - 1, 0, len(ends) - 2)
+        t = 2.0 * (s - ends[element]) / (ends[element + 1] - ends[element]) - 1.0
+        shape, _ = lagrange(order, t)
+        ids = self.beam.rows[element][:, :, None] + np.arange(4)
+        weights = shape[:, :, None] * factors[:, None, :]
+        return EmbeddedPoints.from_weights(ids.reshape(len(s), -1), weights.reshape(len(s), -1), nodes)
+
+
+def straight_places(length: float, elements: int | Sequence[float] | np.ndarray, order: int) -> np.ndarray:
+    """Return the places of frames [m] for a number of equal elements, or for given ends of elements, shape (c,).
+
+    Raises:
+        ValueError: if the ends do not rise from zero to the length.
+    """
+    ends = np.linspace(0.0, length, elements + 1) if isinstance(elements, int) else np.asarray(elements, dtype=float)
+    if len(ends) < 2 or not (np.diff(ends) > 0.0).all() or not np.allclose(ends[[0, -1]], [0.0, length], atol=1e-9):
+        raise ValueError(f"ends of elements must rise from 0 to {length:g} m, got {ends.tolist()}")
+    if order == 1:
+        return ends
+    return np.insert(ends, np.arange(1, len(ends)), 0.5 * (ends[1:] + ends[:-1]))
+
+
+def transported_frames(points: np.ndarray, up: ArrayLike | None) -> np.ndarray:
+    """Return rotations (c, 3, 3) of frames along a line (c, 3): d_1 along it, d_2 as near to the last one as possible.
+
+    Args:
+        points: positions [m].
+        up: direction of the first d_2; default: the axis of space that is least along the line.
+
+    Raises:
+        ValueError: if two successive points coincide, or ``up`` is along the line.
+    """
+    edges = np.diff(points, axis=0)
+    lengths = np.linalg.norm(edges, axis=1)
+    if not (lengths > 1e-9).all():
+        raise ValueError(f"two successive points of a rod coincide: {points.tolist()} m")
+    units = edges / lengths[:, None]
+    # Through three points goes a parabola; at its middle one, this is its tangent.
+    inner = (units[:-1] * lengths[1:, None] + units[1:] * lengths[:-1, None]) / (lengths[1:] + lengths[:-1])[:, None]
+    first = 2.0 * units[0] - inner[0] if len(inner) else units[0]
+    last = 2.0 * units[-1] - inner[-1] if len(inner) else units[-1]
+    tangents = np.vstack([first, inner, last])
+    tangents /= np.linalg.norm(tangents, axis=1)[:, None]
+    second = np.eye(3)[np.abs(tangents[0]).argmin()] if up is None else np.asarray(up, dtype=float)
+    frames = np.empty((len(points), 3, 3))
+    for k, tangent in enumerate(tangents):
+        second = second - (second @ tangent) * tangent
+        size = float(np.linalg.norm(second))
+        if not size > 1e-6:
+            raise ValueError(f"up = {np.asarray(up).tolist()} must not be along the rod")
+        second = second / size
+        frames[k] = np.column_stack([tangent, second, np.cross(tangent, second)])
+    return frames
+
+
+def outlines(section: Section | Callable[[float], Section], places: np.ndarray) -> np.ndarray | None:
+    """Return the outlines of the cross-sections at places [m], shape (c, k, 2); None if they have none."""
+    sections = [section if isinstance(section, Section) else section(float(s)) for s in places]
+    shapes = {len(s.outline) for s in sections}
+    return np.array([s.outline for s in sections]) if len(shapes) == 1 and 0 not in shapes else None
