@@ -137,7 +137,7 @@ class ModelBuilder:
         held: str = "start",
         **options: Any,
     ) -> list[int]:
-        """Add a rod: beam elements along a line, with the surface of its sections. It is the next of the model's `rods`.
+        """Add a rod: beam elements along a line, with the surface of its sections; the next of the model's `rods`.
 
         Args:
             path: both ends of a straight rod [m], shape (2, 3), or all frames of a curved one, shape (c, 3). The rod is

@@ -42,6 +42,7 @@ from softgym_envs.mechanics.solids import (
     check_size,
     described,
     fixed_mask,
+    nodes_in_box,
     solid_part,
 )
 from softgym_envs.mechanics.surfaces import cavity_around
@@ -236,7 +237,7 @@ class MechanicalModel:
         if (fixed is None) == (fixed_box is None):
             raise ValueError("pass the clamped nodes as either 'fixed' or 'fixed_box'")
         if fixed_box is not None:
-            fixed = _nodes_in_box(mesh.nodes, fixed_box)
+            fixed = nodes_in_box(mesh.nodes, fixed_box)
         assert fixed is not None
         return cls.from_mesh(mesh.nodes, mesh.tetrahedra, fixed=fixed, regions=mesh.regions, **options)
 
@@ -439,7 +440,13 @@ class MechanicalModel:
         return air
 
     def add_effector(
-        self, name: str, point: ArrayLike | EmbeddedPoints, *, hint: np.ndarray | None = None, block: int = 0, radius: float = 0.0
+        self,
+        name: str,
+        point: ArrayLike | EmbeddedPoints,
+        *,
+        hint: np.ndarray | None = None,
+        block: int = 0,
+        radius: float = 0.0,
     ) -> Point:
         """Add an effector at a material point [m] (3,) of a solid, or averaged over a radius [m] (see `embed`).
 
@@ -616,18 +623,3 @@ class MechanicalModel:
     def energy(self, x: np.ndarray) -> float:
         """Elastic energy plus potential of the dead loads [J] at positions ``x`` (n, 3); inf if inverted."""
         return self.elastic_energy(x) - float(np.vdot(self.loads, x - self.nodes))
-
-
-def _nodes_in_box(nodes: np.ndarray, box: Sequence[float]) -> np.ndarray:
-    """Mask (n,) of the nodes inside (xmin, xmax, ymin, ymax, zmin, zmax) [m]."""
-    limits = np.asarray(box, dtype=float)
-    if limits.shape != (6,):
-        raise ValueError(f"fixed_box must be xmin, xmax, ymin, ymax, zmin, zmax, got {box!r}")
-    low, high = limits.reshape(3, 2).T
-    inside = np.all((nodes >= low) & (nodes <= high), axis=1)
-    if not inside.any():
-        spans = ", ".join(f"{a:.3g} to {b:.3g}" for a, b in zip(nodes.min(axis=0), nodes.max(axis=0), strict=True))
-        raise ValueError(
-            f"no node is fixed: none lies in fixed_box {limits.tolist()} m; the body spans {spans} m along x, y and z"
-        )
-    return inside

@@ -208,3 +208,18 @@ def _element_values(
     if array.ndim and array.shape != (count,):
         raise ValueError(f"{name} must be one number, or one for each of the {count} elements, got shape {array.shape}")
     return array if array.ndim else float(array)
+
+
+def nodes_in_box(nodes: np.ndarray, box: Sequence[float]) -> np.ndarray:
+    """Mask (n,) of the nodes inside (xmin, xmax, ymin, ymax, zmin, zmax) [m]."""
+    limits = np.asarray(box, dtype=float)
+    if limits.shape != (6,):
+        raise ValueError(f"fixed_box must be xmin, xmax, ymin, ymax, zmin, zmax, got {box!r}")
+    low, high = limits.reshape(3, 2).T
+    inside = np.all((nodes >= low) & (nodes <= high), axis=1)
+    if not inside.any():
+        spans = ", ".join(f"{a:.3g} to {b:.3g}" for a, b in zip(nodes.min(axis=0), nodes.max(axis=0), strict=True))
+        raise ValueError(
+            f"no node is fixed: none lies in fixed_box {limits.tolist()} m; the body spans {spans} m along x, y and z"
+        )
+    return inside

@@ -118,7 +118,9 @@ class Dynamics(Statics):
         if CableFriction.of(model) is not None:
             raise ValueError("cables with friction are computed in statics only; allowed: dynamics with friction = 0")
         if any(constraint.compliance for constraint, _ in model.rows):
-            raise ValueError("drives with compliance are computed in statics only; allowed: dynamics with compliance = 0")
+            raise ValueError(
+                "drives with compliance are computed in statics only; allowed: dynamics with compliance = 0"
+            )
         self.step = float(step)
         if not 0.0 <= spectral_radius <= 1.0:
             raise ValueError(f"spectral_radius = {spectral_radius} is out of bounds; allowed: [0, 1]")
