@@ -76,7 +76,7 @@ class MechanicalModel:
             ``"s"`` sensors (measured, never loaded), ``"b"`` bonds (held at zero, not part of the condensed model).
         nodal_loads: dead loads on the rows besides gravity [N], shape (n, 3); change them in place.
         skins: surfaces of beams and rigid parts, for pictures and contact.
-        rods: beams along a line, from `ModelBuilder.add_rod` or `from_rod`.
+        rods: beams along a line, from `ModelBuilder.add_rod`.
         named_loads: loads from `add_load` by name.
         contact: what the surface of the body touches, or None; see `set_contact`.
         kinematics: degrees of freedom, and the motions that belong to them.
@@ -241,17 +241,6 @@ class MechanicalModel:
         assert fixed is not None
         return cls.from_mesh(mesh.nodes, mesh.tetrahedra, fixed=fixed, regions=mesh.regions, **options)
 
-    @classmethod
-    def from_rod(
-        cls, path: ArrayLike, *, gravity: Sequence[float] = (0.0, 0.0, 0.0), solver: str = "auto", **options: Any
-    ) -> MechanicalModel:
-        """Make a model of one rod; path and options as for `ModelBuilder.add_rod`."""
-        from softgym_envs.mechanics.builder import ModelBuilder
-
-        builder = ModelBuilder(gravity=gravity, solver=solver)
-        builder.add_rod(path, **options)
-        return builder.build()
-
     @property
     def solids(self) -> list[SolidBlock]:
         """The blocks of solid elements."""
@@ -339,38 +328,9 @@ class MechanicalModel:
         self.add("a", cable)
         return cable
 
-    def add_tendon(
-        self,
-        name: str,
-        places: ArrayLike,
-        offsets: ArrayLike,
-        *,
-        rod: int = 0,
-        pull_point: ArrayLike | None = None,
-        unilateral: bool = True,
-        compliance: float = 0.0,
-    ) -> Cable:
-        """Add a tendon along a rod: a cable that runs straight from disc to disc, without friction unless it is set.
-
-        Args:
-            name: identifier.
-            places: of the discs that guide it, along the rod at rest from the base to the anchor [m], shape (p,).
-            offsets: of the tendon along d_2 and d_3 in each disc [m], shape (2,) or (p, 2).
-            rod: its number among `rods`.
-            pull_point: fixed point where the tendon leaves [m], shape (3,); default: beside the start of the rod, with
-                the offset of the first disc.
-            unilateral: True for a real tendon, which cannot push.
-            compliance: how far it stretches per tension [m/N], see `Cable`.
-
-        Raises:
-            ValueError: for a disc that is not on the rod.
-        """
-        line = self.rods[rod]
-        through = np.broadcast_to(np.asarray(offsets, dtype=float), (np.size(places), 2))
-        if pull_point is None:
-            pull_point = line.points(0.0, through[0], self.nodes).points[0]
-        embedding = line.points(places, through, self.nodes)
-        tendon = Cable(name, embedding, np.asarray(pull_point), unilateral=unilateral, compliance=compliance)
+    def add_tendon(self, name: str, places: ArrayLike, offsets: ArrayLike, *, rod: int = 0, **options: Any) -> Cable:
+        """Add a tendon along the rod of a number among `rods`; the other arguments are those of `Rod.tendon`."""
+        tendon = self.rods[rod].tendon(name, places, offsets, self.nodes, **options)
         self.add("a", tendon)
         return tendon
 
@@ -514,13 +474,10 @@ class MechanicalModel:
                 self._gravity_forces += block.nodal_masses(len(self.nodes))[:, None] * acceleration
 
     def add_load(self, name: str, force: ArrayLike, on: EmbeddedPoints | Rod | Fixed) -> None:
-        """Add a force that keeps its direction, or change one of the same name.
+        """Add a force [N] (3,) that keeps its direction, or change the one of the same name.
 
-        Args:
-            name: identifier.
-            force: the whole of it [N], shape (3,).
-            on: what carries it: embedded points in equal parts, a rod evenly along its length, or the nodes of a
-                straight edge (a mask, indices, or a function of the nodes that returns one) in proportion to it.
+        It acts on embedded points in equal parts, evenly along a rod, or on the nodes of a straight edge, given as for
+        ``fixed``, in proportion to its length.
 
         Raises:
             ValueError: if the force is not three finite numbers, or acts on no node or on no straight edge.

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from softgym_envs.mechanics.constraints.cable import Cable
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.elements.beams import Beam, Section, lagrange
 
@@ -66,6 +67,38 @@ class Rod:
         ids = self.beam.rows[element][:, :, None] + np.arange(4)
         weights = shape[:, :, None] * factors[:, None, :]
         return EmbeddedPoints.from_weights(ids.reshape(len(s), -1), weights.reshape(len(s), -1), nodes)
+
+    def tendon(
+        self,
+        name: str,
+        places: ArrayLike,
+        offsets: ArrayLike,
+        nodes: np.ndarray,
+        *,
+        pull_point: ArrayLike | None = None,
+        unilateral: bool = True,
+        compliance: float = 0.0,
+    ) -> Cable:
+        """Return a tendon along the rod: a cable that runs straight from disc to disc.
+
+        Args:
+            name: identifier.
+            places: of the discs that guide it, along the rod at rest from the base to the anchor [m], shape (p,).
+            offsets: of the tendon along d_2 and d_3 in each disc [m], shape (2,) or (p, 2).
+            nodes: rest rows [m], shape (n, 3).
+            pull_point: fixed point where the tendon leaves [m], shape (3,); default: beside the start of the rod, with
+                the offset of the first disc.
+            unilateral: True for a real tendon, which cannot push.
+            compliance: how far it stretches per tension [m/N], see `Cable`.
+
+        Raises:
+            ValueError: for a disc that is not on the rod.
+        """
+        through = np.broadcast_to(np.asarray(offsets, dtype=float), (np.size(places), 2))
+        if pull_point is None:
+            pull_point = self.points(0.0, through[0], nodes).points[0]
+        guides = self.points(places, through, nodes)
+        return Cable(name, guides, np.asarray(pull_point), unilateral=unilateral, compliance=compliance)
 
 
 def straight_places(length: float, elements: int | Sequence[float] | np.ndarray, order: int) -> np.ndarray:

@@ -15,10 +15,16 @@ EI, EA = MODULUS * SECTION.inertia[0], MODULUS * SECTION.area
 STEEL = {"section": Section.circle(8e-4), "young_modulus": 200e9, "poisson_ratio": 0.33, "density": 7870.0}
 
 
+def rod_model(path, gravity=(0.0, 0.0, 0.0), **options):
+    builder = ModelBuilder(gravity=gravity)
+    builder.add_rod(path, **options)
+    return builder.build()
+
+
 def straight(elements=20, **options):
     """A rod along z, clamped at the origin, with d_2 along x."""
     given = {"section": SECTION, "young_modulus": MODULUS, "density": 6450.0, "up": [1, 0, 0], **options}
-    return MechanicalModel.from_rod([[0, 0, 0], [0, 0, LENGTH]], elements=elements, **given)
+    return rod_model([[0, 0, 0], [0, 0, LENGTH]], elements=elements, **given)
 
 
 def tip(model, state):
@@ -109,7 +115,7 @@ def test_shapes_that_sorosim_published(gravity, middle, end, shape):
     From `data/reference/sorosim/sorosim_statics/SpringSteelRodMuJoCo_dataStatics.csv` of
     github.com/ContinuumRoboticsLab/opencr-mujoco (MIT), shapes 1 to 3, which have four digits.
     """
-    model = MechanicalModel.from_rod([[0, 0, 0], [0.6, 0, 0]], elements=20, up=[0, 1, 0], gravity=gravity, **STEEL)
+    model = rod_model([[0, 0, 0], [0.6, 0, 0]], elements=20, up=[0, 1, 0], gravity=gravity, **STEEL)
     solver, chain = Statics(model), model.rods[0].beam.chain
     x = model.nodes
     # A moment M is the forces M x d_k / 2 on the directors, which turn with them: repeat until they rest.
