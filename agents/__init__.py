@@ -8,8 +8,6 @@ if TYPE_CHECKING:
     from softgym_envs.agents.config import EnvironmentConfig as EnvironmentConfig
     from softgym_envs.agents.config import TrainConfig as TrainConfig
     from softgym_envs.agents.evaluation import evaluate as evaluate
-    from softgym_envs.agents.export import export_policy_onnx as export_policy_onnx
-    from softgym_envs.agents.export_c import export_policy_c as export_policy_c
     from softgym_envs.agents.policy import Policy as Policy
     from softgym_envs.agents.training import train as train
     from softgym_envs.agents.vec_env import SB3VecEnv as SB3VecEnv
@@ -22,8 +20,6 @@ __getattr__, __dir__, __all__ = lazy_exports(
     {
         "config": ["EnvironmentConfig", "TrainConfig"],
         "evaluation": ["evaluate"],
-        "export": ["export_policy_onnx"],
-        "export_c": ["export_policy_c"],
         "policy": ["Policy"],
         "training": ["train"],
         "vec_env": ["SB3VecEnv"],

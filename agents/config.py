@@ -307,7 +307,7 @@ class CloningConfig(GradientConfig):
 
 
 class RecurrentConfig(GradientConfig):
-    """Hyperparameters of the imitation by a network with memory (`softgym_envs.agents.learners.recurrent`)."""
+    """Hyperparameters of the imitation by a network with memory (`softgym_envs.extensions.learners.recurrent`)."""
 
     net_arch: list[int] = Field(default=[64], min_length=1, max_length=1, description="width of the memory")
     batch_size: int = Field(default=32, gt=0, description="episodes of each update")
@@ -318,7 +318,7 @@ class RecurrentConfig(GradientConfig):
 
 
 class EvolutionConfig(Config):
-    """Hyperparameters of the evolution of weights (`softgym_envs.agents.learners.evolution`)."""
+    """Hyperparameters of the evolution of weights (`softgym_envs.extensions.learners.evolution`)."""
 
     step_size: float = Field(default=0.2, gt=0, description="first standard deviation of each weight")
     net_arch: list[int] = Field(default=[], description="widths of hidden layers; none for a linear policy")

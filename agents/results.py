@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 
+from softgym_envs.agents.baselines import BASELINES
 from softgym_envs.agents.config import EnvironmentConfig
 from softgym_envs.agents.statistics import Estimate, crossed_estimate, stratified_estimate
 from softgym_envs.errors import DataError
@@ -35,15 +36,10 @@ LEARNERS = {
 MODEL_BASED = ("analytic", "cloning", "recurrent")
 """Learners that know the model of the robot, as the inverse QP does; the others are model-free."""
 
-AGENTS = LEARNERS | {
-    "qp": "QP",
-    "qp_model": "QP, model",
-    "qp_pi": "QP, model, PI",
-    "qp_estimated": "QP, estimator",
-    "close": "open loop",
-    "force": "force control",
-    "random": "random",
-}
+
+def agent_titles() -> dict[str, str]:
+    """Return the titles of all agents by name: learners, then agents that need no training."""
+    return LEARNERS | {name: cls.title for name, cls in BASELINES.items()}
 
 
 #: Colours of the curves of each learner: single seeds, and their mean.
@@ -229,7 +225,7 @@ def summary(runs: list[StoredRuns]) -> list[Summary]:
         metres = entry.environment.task_class.goal_unit == "m"
         quantity = ("tracking_distance" if entry.follows else "distance") if metres else "relative_error"
         for backend in sorted({entry.environment.backend, "fem"}):
-            for agent in AGENTS:
+            for agent in agent_titles():
                 scores = entry.scores(agent, backend, "tracking_distances" if entry.follows else "distances")
                 successes = entry.scores(agent, backend, "successes")
                 if scores is None or successes is None:
@@ -261,13 +257,14 @@ def _evaluated(runs: Sequence[StoredRuns]) -> list[str]:
     """Return the agents of which there are evaluations."""
     return [
         agent
-        for agent in AGENTS
+        for agent in agent_titles()
         if any(entry.scores(agent, backend, "returns") is not None for entry in runs for backend in ("own", "fem"))
     ]
 
 
 def _head(first: str, agents: Sequence[str]) -> list[str]:
-    return [f"| {first} | " + " | ".join(AGENTS[agent] for agent in agents) + " |", "|---" * (len(agents) + 1) + "|"]
+    titles = agent_titles()
+    return [f"| {first} | " + " | ".join(titles[agent] for agent in agents) + " |", "|---" * (len(agents) + 1) + "|"]
 
 
 def _distance(entry: StoredRuns, agent: str, backend: str) -> str:

@@ -155,14 +155,12 @@ def train_and_evaluate(path: Path, seed: int, folder: Path, goals: int, fem_goal
 
 def evaluate_baselines(path: Path, folder: Path, goals: int, fem_goals: int) -> Path:
     """Evaluate the agents that need no training on the goals of a configuration; return the file of the result."""
-    from softgym_envs.agents.baselines import baselines_for
-
     result = folder / "results" / path.stem / "baselines.json"
     config = load_config(path, TrainConfig)
     if _finished(result, config, goals, fem_goals):
         return result
     environment = config.environment
-    agents: dict[str, str | Path] = {name: name for name in baselines_for(environment.task_class)}
+    agents: dict[str, str | Path] = {name: name for name in environment.task_class.agents}
     write_json(
         result,
         {

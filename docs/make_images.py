@@ -27,9 +27,9 @@ from softgym_envs import make_robot
 from softgym_envs.agents.evaluation import make_agent
 from softgym_envs.backends import make_backend
 from softgym_envs.extensions.leaderboard import plots
+from softgym_envs.extensions.modules import MODULES
 from softgym_envs.mechanics import Statics
 from softgym_envs.robots import ROBOTS
-from softgym_envs.robots.modules import MODULES
 from softgym_envs.viewer.image import ImageRenderer
 from softgym_envs.viewer.video import write_video
 
@@ -56,7 +56,7 @@ MODULE_MOTIONS = {
     "torsion_tube": (5, 0.8),
     "accordion": (2, 0.008),
 }
-"""Component of `softgym_envs.robots.modules.base.POSE` and value, for the picture of each module."""
+"""Component of `softgym_envs.extensions.modules.base.POSE` and value, for the picture of each module."""
 WIDTH, HEIGHT = 800, 520
 SHOWN = ("finger_reach", "trunk_track", "gripper_lift")
 """Environments of the animation of the home page."""

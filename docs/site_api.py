@@ -17,16 +17,18 @@ PACKAGES = {
     "softgym_envs.errors": "Errors",
     "softgym_envs.envs": "Environments",
     "softgym_envs.robots": "Robots",
-    "softgym_envs.robots.modules": "Compliant modules",
     "softgym_envs.mechanics": "Mechanics",
     "softgym_envs.surrogate": "Surrogates",
     "softgym_envs.backends": "Backends",
     "softgym_envs.control": "Control",
-    "softgym_envs.estimation": "Estimation",
     "softgym_envs.viewer": "Pictures",
     "softgym_envs.agents": "Agents",
     "softgym_envs.codesign": "Co-design",
-    "softgym_envs.extensions.leaderboard": "Benchmark of co-design",
+    "softgym_envs.extensions.grasping": "Extension: grasping",
+    "softgym_envs.extensions.modules": "Extension: compliant modules",
+    "softgym_envs.extensions.sensing": "Extension: sensing",
+    "softgym_envs.extensions.deployment": "Extension: deployment",
+    "softgym_envs.extensions.leaderboard": "Extension: benchmark of co-design",
 }
 """Packages that export public names and the module of the exceptions, with the titles of their pages."""
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from softgym_envs import make_robot
 from softgym_envs.backends import make_backend
-from softgym_envs.control import ContactControl, ContactQP, ForceGoal
+from softgym_envs.extensions.grasping import ContactControl, ContactQP, ForceGoal
 
 rod = {"kind": "cylinder", "name": "rod", "point": [0.0, 0.055, -0.1], "axis": [1.0, 0.0, 0.0], "radius": 0.01}
 robot = make_robot("finger", obstacles=[{**rod, "friction": 0.3}])

@@ -46,6 +46,11 @@ class Table(Mapping[str, Any]):
             raise ValueError(unknown_name(self.kind, name, self))
         return self[name]
 
+    def place(self, name: str) -> str:
+        """Return where the object with a name is, ``"module:object"``, without importing it."""
+        self._discover()
+        return _path(self._entries[name])
+
     def __getitem__(self, name: str) -> Any:
         if name not in self:
             raise KeyError(name)
@@ -201,7 +206,7 @@ class Registry(Table):
 
 
 def import_object(kind: str, path: str) -> Any:
-    """Return the object at a path ``"module:name"``.
+    """Return the object at a path ``"module:name"``, or the module at a path without a name.
 
     Args:
         kind: what the object should be, for messages: ``"robot"``, ...
@@ -217,6 +222,8 @@ def import_object(kind: str, path: str) -> Any:
         if error.name is None or not f"{name_of_module}.".startswith(f"{error.name}."):
             raise  # the module exists, but one that it imports does not
         raise ValueError(f"{kind} '{path}': there is no module '{name_of_module}'") from None
+    if not name:
+        return module
     if not hasattr(module, name):
         raise ValueError(f"{kind} '{path}': module '{name_of_module}' has no '{name}'")
     return getattr(module, name)

@@ -18,11 +18,13 @@ PACKAGES = [
     "softgym_envs.codesign",
     "softgym_envs.control",
     "softgym_envs.envs",
-    "softgym_envs.estimation",
+    "softgym_envs.extensions.deployment",
+    "softgym_envs.extensions.grasping",
     "softgym_envs.extensions.leaderboard",
+    "softgym_envs.extensions.modules",
+    "softgym_envs.extensions.sensing",
     "softgym_envs.mechanics",
     "softgym_envs.robots",
-    "softgym_envs.robots.modules",
     "softgym_envs.surrogate",
     "softgym_envs.viewer",
 ]
@@ -78,7 +80,6 @@ def test_all_packages_with_public_names_are_listed():
         for path in [ROOT / "softgym_envs" / "__init__.py", *(ROOT / "softgym_envs").glob("*/__init__.py")]
         + [
             *(ROOT / "softgym_envs").glob("extensions/*/__init__.py"),
-            *(ROOT / "softgym_envs").glob("*/modules/__init__.py"),
         ]
         if "lazy_exports(" in path.read_text() or re.search(r"^__all__ = \[", path.read_text(), flags=re.MULTILINE)
     ]

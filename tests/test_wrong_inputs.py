@@ -22,8 +22,8 @@ from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.tools.config import CalibrationConfig, OptimiseConfig
 from softgym_envs.config import load_config
 from softgym_envs.errors import SoftGymError
-from softgym_envs.estimation.loads import Payload, Touch, finger_grid
-from softgym_envs.estimation.readings import Noise
+from softgym_envs.extensions.sensing.loads import Payload, Touch, finger_grid
+from softgym_envs.extensions.sensing.readings import Noise
 from softgym_envs.mechanics import MechanicalModel
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints

@@ -12,8 +12,8 @@ from softgym_envs.codesign.metrics.metric import metric
 from softgym_envs.codesign.metrics.sources import Source, needs_fem
 from softgym_envs.config import Config
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
-from softgym_envs.robots.contact_aided_finger import ContactAidedFinger
-from softgym_envs.robots.grasping import Grasp, GraspObject, evaluate_grasp
+from softgym_envs.extensions.grasping.grasps import Grasp, GraspObject, evaluate_grasp
+from softgym_envs.extensions.grasping.robots.contact_aided_finger import ContactAidedFinger
 
 if TYPE_CHECKING:
     from softgym_envs.codesign.tools.bodies import Body

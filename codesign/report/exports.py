@@ -108,13 +108,13 @@ def _download(folder: Path, name: str, text: str) -> Download:
 
 
 def _body(robot: Robot, path: Path, design: dict[str, float]) -> None:
-    from softgym_envs.robots.geometry.export import export_body
+    from softgym_envs.extensions.deployment.cad import export_body
 
     export_body(robot, path, design)
 
 
 def _onnx(policy: Path, path: Path) -> None:
-    from softgym_envs.agents.export import export_policy_onnx
+    from softgym_envs.extensions.deployment.policy_onnx import export_policy_onnx
 
     export_policy_onnx(policy, path)
 

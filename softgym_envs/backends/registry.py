@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from softgym_envs.registry import Registry, check_options
 
@@ -20,31 +20,9 @@ BACKENDS = Registry(
         "hybrid": "softgym_envs.backends.hybrid:HybridBackend",
     },
     base="softgym_envs.backends.backend:Backend",
+    group="softgym_envs.backends",
 )
-"""Backends by name."""
-
-CHAINS = Registry(
-    "backend",
-    {
-        "fem": "softgym_envs.backends.fem:FEMBackend",
-        "surrogate": "softgym_envs.backends.chain:ChainBackend",
-        "hybrid": "softgym_envs.backends.hybrid_chain:HybridChainBackend",
-    },
-    base="softgym_envs.backends.backend:Backend",
-)
-"""Backends of robots that are learned as chains, by the same names."""
-
-
-HANDS = Registry(
-    "backend",
-    {
-        "fem": "softgym_envs.backends.fem:FEMBackend",
-        "surrogate": "softgym_envs.backends.chain_hand:ChainHandBackend",
-        "hybrid": "softgym_envs.backends.hybrid_chain:HybridHandBackend",
-    },
-    base="softgym_envs.backends.backend:Backend",
-)
-"""Backends of hands of fingers that are learned as chains, by the same names."""
+"""Backends by name: those of the suite and of installed packages."""
 
 BATCHES = Registry(
     "batched backend",
@@ -56,8 +34,15 @@ BATCHES = Registry(
 )
 """Backends that step many bodies at once, by the same names."""
 
-LEARNED = {"potential": BACKENDS, "chain": CHAINS, "hand": HANDS}
-"""Backends by what is learned of a robot."""
+
+def backend_class(name: str, robot: Robot) -> type[Backend]:
+    """Return the class of the backend with a name, for a robot that may have one of its own (`Robot.backends`).
+
+    Raises:
+        ValueError: for an unknown name.
+    """
+    found: type[Backend] = BACKENDS.resolve(robot.backends.get(name, name))
+    return found
 
 
 def check_backend(name: str, robot: Robot, options: Mapping[str, object]) -> None:
@@ -66,7 +51,7 @@ def check_backend(name: str, robot: Robot, options: Mapping[str, object]) -> Non
     Raises:
         ValueError: for an unknown name or option, or a value of the wrong type.
     """
-    check_options(f"backend '{name}'", LEARNED[robot.learned].resolve(name), 2, options)
+    check_options(f"backend '{name}'", backend_class(name, robot), 2, options)
 
 
 def make_backend(name: str, robot: Robot, **options: object) -> Backend:
@@ -75,7 +60,10 @@ def make_backend(name: str, robot: Robot, **options: object) -> Backend:
     Raises:
         ValueError: for an unknown name or option.
     """
-    return LEARNED[robot.learned].make(name, robot, **options)
+    check_backend(name, robot, options)
+    cls: Any = backend_class(name, robot)
+    made: Backend = cls(robot, **options)
+    return made
 
 
 def is_batched(name: str, robot: Robot, options: Mapping[str, object]) -> bool:

@@ -314,7 +314,7 @@ class SurrogateBackend(Backend):
         if not robot.convex:
             raise ValueError(
                 f"robot '{robot.name}' has a non-convex energy and cannot run on the surrogate alone; use "
-                "backend='fem', or its learned model as part of a gripper (softgym_envs.control.CoupledFingers)"
+                "backend='fem', or its learned model as part of a gripper"
             )
         self.robot = robot
         learned = robot.under_touch()

@@ -165,8 +165,8 @@ def deploy_policy(policy: str, files: tuple[Path, ...], name: str) -> None:
     POLICY is a file or the name of a shipped policy. FILES end with .h or .onnx. Both map sensor values in SI units to
     commands.
     """
-    from softgym_envs.agents.export import export_policy_onnx
-    from softgym_envs.agents.export_c import export_policy_c
+    from softgym_envs.extensions.deployment.policy_c import export_policy_c
+    from softgym_envs.extensions.deployment.policy_onnx import export_policy_onnx
 
     for file in files:
         if file.suffix not in (".h", ".onnx"):

@@ -88,8 +88,8 @@ def export(
 
     FILES end with .step or .stl; all lengths are in millimetres.
     """
-    from softgym_envs.robots.geometry.export import export_body
-    from softgym_envs.robots.geometry.moulds import export_moulds
+    from softgym_envs.extensions.deployment.cad import export_body
+    from softgym_envs.extensions.deployment.moulds import export_moulds
 
     if not files and moulds is None:
         raise ConfigError("nothing to write: pass a file ending with .step or .stl, or a folder with --moulds")

@@ -164,9 +164,9 @@ def deploy(
     that steps it. For the sensorized finger, unless it is commanded by efforts, the folder also gets estimator.h, which
     finds the tip from the volumes of the cavities and the touched cell, and loop.c, the closed loop of both.
     """
-    from softgym_envs.surrogate.export.c import export_c
-    from softgym_envs.surrogate.export.common import FORMATS
-    from softgym_envs.surrogate.export.onnx import export_onnx
+    from softgym_envs.extensions.deployment.common import FORMATS
+    from softgym_envs.extensions.deployment.surrogate_c import export_c
+    from softgym_envs.extensions.deployment.surrogate_onnx import export_onnx
     from softgym_envs.surrogate.pretrained import pretrained_model
 
     if not files and controller is None:
@@ -192,9 +192,9 @@ def deploy(
         click.echo(f"wrote {file}")
     if controller is None:
         return
-    from softgym_envs.control.embedded import PICorrection
-    from softgym_envs.control.export.c import COMPILE, export_controller_c
     from softgym_envs.control.inverse_qp import InverseQP
+    from softgym_envs.control.pi_correction import PICorrection
+    from softgym_envs.extensions.deployment.controller_c import COMPILE, export_controller_c
 
     qp = InverseQP.for_robot(body)
     if max_effort is not None:
@@ -207,10 +207,10 @@ def deploy(
     ]
     commands = [COMPILE]
     if learned is not body and max_effort is None:
-        from softgym_envs.estimation import finger_grid
-        from softgym_envs.estimation.export.c import COMPILE_LOOP, export_estimator_c
-        from softgym_envs.estimation.learned import LearnedEstimator
-        from softgym_envs.surrogate.export.common import exportable
+        from softgym_envs.extensions.deployment.common import exportable
+        from softgym_envs.extensions.sensing import finger_grid
+        from softgym_envs.extensions.sensing.estimator_c import COMPILE_LOOP, export_estimator_c
+        from softgym_envs.extensions.sensing.learned import LearnedEstimator
 
         estimator = LearnedEstimator(body, design=chosen, model=exportable(model, members))
         paths += export_estimator_c(estimator, finger_grid(), controller, name=name)

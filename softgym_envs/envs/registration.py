@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from softgym_envs.errors import unknown_name
+from softgym_envs.registry import Table
 
 if TYPE_CHECKING:
     from gymnasium.envs.registration import EnvSpec
@@ -72,41 +73,36 @@ class EnvironmentRow:
         )
 
 
-def _row(robot: str, task: str, max_episode_steps: int, backend: str = "surrogate", **options: Any) -> EnvironmentRow:
+def environment_row(
+    robot: str, task: str, max_episode_steps: int, backend: str = "surrogate", **options: Any
+) -> EnvironmentRow:
+    """Return the row of an environment that runs on the surrogate by default; see `EnvironmentRow`."""
     return EnvironmentRow(robot, task, max_episode_steps, backend, **options)
 
 
 MOVING = {"dynamics": True}
-# One implicit step per control step damps all vibrations, but objects fall.
-SLOW = {"dynamics": True, "time_step": 0.05}
-COARSE = {"mesh_size": 0.020}
 
 ENVIRONMENTS: dict[str, EnvironmentRow] = {
-    "SoftGym/FingerReach-v0": _row("finger", "reach", 50),
-    "SoftGym/FingerTrack-v0": _row("finger", "track", 100),
-    "SoftGym/DiamondReach-v0": _row("diamond", "reach", 50),
+    "SoftGym/FingerReach-v0": environment_row("finger", "reach", 50),
+    "SoftGym/FingerTrack-v0": environment_row("finger", "track", 100),
+    "SoftGym/DiamondReach-v0": environment_row("diamond", "reach", 50),
     # Without cables that push, part of the published circle is out of reach.
-    "SoftGym/DiamondTrack-v0": _row("diamond", "track", 100, robot_options={"unilateral": False}),
-    "SoftGym/CableTrunkReach-v0": _row("cable_trunk", "reach", 50),
-    "SoftGym/CableTrunkTrack-v0": _row("cable_trunk", "track", 100),
-    "SoftGym/TrunkReach-v0": _row("trunk", "reach", 50),
-    "SoftGym/TrunkTrack-v0": _row("trunk", "track", 100),
-    "SoftGym/FingerPress-v0": _row("press_finger", "track", 100),
-    "SoftGym/GripperPinch-v0": _row("two_finger_gripper", "track", 100),
-    "SoftGym/GripperManipulate-v0": _row("three_finger_gripper", "track", 100),
-    "SoftGym/SensorizedFingerReach-v0": _row(
-        "sensorized_finger", "sensed_reach", 50, backend="fem", plant={"noise": 0.01}
-    ),
-    "SoftGym/FingerGrasp-v0": _row("grasping_finger", "grasp", 25, backend="fem", backend_mesh=COARSE),
-    "SoftGym/GripperLift-v0": _row(
-        "contact_aided_gripper", "lift", 30, backend="fem", backend_mesh=COARSE, backend_options=SLOW
-    ),
-    "SoftGym/ModularReach-v0": _row("modular_arm", "reach", 50, backend="fem"),
-    "SoftGym/TetrapodReach-v0": _row("tetrapod", "reach", 100, backend="fem", backend_options=MOVING),
-    "SoftGym/TetrapodTrack-v0": _row("tetrapod", "track", 100, backend="fem", backend_options=MOVING),
-    "SoftGym/TetrapodCarry-v0": _row("tetrapod", "carry", 100, backend="fem", backend_options=MOVING),
+    "SoftGym/DiamondTrack-v0": environment_row("diamond", "track", 100, robot_options={"unilateral": False}),
+    "SoftGym/CableTrunkReach-v0": environment_row("cable_trunk", "reach", 50),
+    "SoftGym/CableTrunkTrack-v0": environment_row("cable_trunk", "track", 100),
+    "SoftGym/TrunkReach-v0": environment_row("trunk", "reach", 50),
+    "SoftGym/TrunkTrack-v0": environment_row("trunk", "track", 100),
+    "SoftGym/FingerPress-v0": environment_row("press_finger", "track", 100),
+    "SoftGym/GripperPinch-v0": environment_row("two_finger_gripper", "track", 100),
+    "SoftGym/GripperManipulate-v0": environment_row("three_finger_gripper", "track", 100),
+    "SoftGym/TetrapodReach-v0": environment_row("tetrapod", "reach", 100, backend="fem", backend_options=MOVING),
+    "SoftGym/TetrapodTrack-v0": environment_row("tetrapod", "track", 100, backend="fem", backend_options=MOVING),
+    "SoftGym/TetrapodCarry-v0": environment_row("tetrapod", "carry", 100, backend="fem", backend_options=MOVING),
 }
-"""All environments of a robot with a task, by ID; `register_environment` adds to them."""
+"""All environments of a robot with a task, by ID; `register_environment` and installed packages add to them."""
+
+INSTALLED = Table("table of environments", {}, group="softgym_envs.environments")
+"""Tables like `ENVIRONMENTS` of installed packages: their entry points are ``name = "module:rows"``."""
 
 
 GENERIC_ENVIRONMENTS: dict[str, EnvironmentRow] = {
@@ -172,9 +168,17 @@ def register_environment(
 
 
 def register_environments() -> None:
-    """Register all rows with Gymnasium."""
+    """Register all rows with Gymnasium, those of installed packages included.
+
+    Raises:
+        ValueError: for an ID that two packages claim.
+    """
     import gymnasium
 
+    for name, rows in INSTALLED.items():
+        for id, row in rows.items():
+            if ENVIRONMENTS.setdefault(id, row) is not row:
+                raise ValueError(f"environment '{id}' of {INSTALLED.place(name)} is already registered: rename it")
     for id, row in {**ENVIRONMENTS, **GENERIC_ENVIRONMENTS}.items():
         if id not in gymnasium.registry:
             _register(row.spec(id))

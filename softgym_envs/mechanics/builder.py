@@ -10,9 +10,7 @@ from numpy.typing import ArrayLike
 
 from softgym_envs.mechanics.elements.beams import Beam, Section
 from softgym_envs.mechanics.elements.block import ElementBlock
-from softgym_envs.mechanics.elements.closed_superelement import ClosedSuperelement, PortVolume
 from softgym_envs.mechanics.elements.rigid import RigidBody
-from softgym_envs.mechanics.elements.superelement import PortEnergy, Superelement
 from softgym_envs.mechanics.frames import frame_rows
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.rods import ENDS, Rod, outlines, straight_places, transported_frames
@@ -177,22 +175,23 @@ class ModelBuilder:
         self._rods.append((len(self._parts) - 1, places, outlines(section, places)))
         return frames
 
-    def add_superelement(
-        self, near: int, far: int, energy: PortEnergy, *, cavity: PortVolume | None = None, **options: Any
+    def add_element(
+        self, kind: type[ElementBlock], frames: Sequence[int], *, own: Sequence[Sequence[bool]] = (), **options: Any
     ) -> None:
-        """Add an elastic part between two frames, known by its energy alone; options as for `Superelement`.
+        """Add an element of any class between frames.
 
-        With the volume of its cavity it is a `ClosedSuperelement`.
+        Args:
+            kind: its class, made as ``kind(nodes, rows, **options)``.
+            frames: first rows of the frames.
+            own: for each row that the element has beside the frames, whether it is held, per axis; the rows come after
+                the frames, and rest at zero.
+            **options: of the class.
         """
-        for row in (near, far):
+        for row in frames:
             if row not in self._frames:
                 raise ValueError(f"row {row} is not the first row of a frame; frames start at rows {self._frames}")
-        options["energy"] = energy
-        if cavity is None:
-            self._parts.append((Superelement, np.array([near, far]), options))
-            return
-        bulge = self._append(np.zeros((1, 3)), np.array([[False, True, True]]))
-        self._parts.append((ClosedSuperelement, np.array([near, far, bulge]), {"cavity": cavity, **options}))
+        start = self._append(np.zeros((len(own), 3)), np.array(own, dtype=bool).reshape(-1, 3))
+        self._parts.append((kind, np.array([*frames, *range(start, self.size)]), options))
 
     def add_mass(self, frame: int, mass: float, inertia: np.ndarray) -> None:
         """Assign a mass [kg] and an inertia along the directors [kg m2] (3, 3) to the rigid part at a frame."""

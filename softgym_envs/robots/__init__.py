@@ -8,19 +8,12 @@ if TYPE_CHECKING:
     from softgym_envs.robots.base import Actuator as Actuator
     from softgym_envs.robots.base import MeshedRobot as MeshedRobot
     from softgym_envs.robots.base import Robot as Robot
-    from softgym_envs.robots.geometry.export import export_body as export_body
-    from softgym_envs.robots.geometry.moulds import export_moulds as export_moulds
-    from softgym_envs.robots.grasping import GraspObject as GraspObject
-    from softgym_envs.robots.grasping import evaluate_grasp as evaluate_grasp
     from softgym_envs.robots.registry import ROBOTS as ROBOTS
 
 __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
     {
         "base": ["Actuator", "MeshedRobot", "Robot"],
-        "geometry.export": ["export_body"],
-        "geometry.moulds": ["export_moulds"],
-        "grasping": ["GraspObject", "evaluate_grasp"],
         "registry": ["ROBOTS"],
     },
 )

@@ -131,8 +131,7 @@ class Robot(ABC):
             pictures are framed by the robot at rest.
         made_of_beams: bodies are quadratic beams and rigid parts, moved by servos or chambers; finite elements step
             many of them at once.
-        learned: how the robot is learned: one ``"potential"`` of its actuators and effectors, a ``"chain"`` of
-            segments for any contacts, or a ``"hand"`` of such chains.
+        backends: backends of its own, ``"module:class"``, by the name that they replace or add.
         symmetries: reflections and rotations, besides the identity, that map every body and its mesh to itself.
             Surrogates also learn from the images of their states.
         non_mechanical_options: options that do not change the condensed model.
@@ -157,7 +156,7 @@ class Robot(ABC):
     convex: bool = True
     free_object: bool = False
     made_of_beams: bool = False
-    learned: str = "potential"
+    backends: Mapping[str, str] = {}
     design_boxes: Mapping[str, Mapping[str, tuple[float, float]]] = {}
     symmetries: tuple[Symmetry, ...] = ()
     non_mechanical_options: tuple[str, ...] = ("unilateral", "design_box")

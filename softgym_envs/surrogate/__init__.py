@@ -5,8 +5,6 @@ from typing import TYPE_CHECKING
 from softgym_envs._lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from softgym_envs.surrogate.export.c import export_c as export_c
-    from softgym_envs.surrogate.export.onnx import export_onnx as export_onnx
     from softgym_envs.surrogate.model import SurrogateModel as SurrogateModel
     from softgym_envs.surrogate.potential.torch import TorchModel as TorchModel
     from softgym_envs.surrogate.pretrained import pretrained_model as pretrained_model
@@ -16,8 +14,6 @@ if TYPE_CHECKING:
 __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
     {
-        "export.c": ["export_c"],
-        "export.onnx": ["export_onnx"],
         "model": ["SurrogateModel"],
         "potential.torch": ["TorchModel"],
         "pretrained": ["pretrained_model"],

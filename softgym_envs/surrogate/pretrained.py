@@ -1,25 +1,43 @@
-"""Weights shipped with the package, each made by ``softgym fit --config <weights name>``."""
+"""Weights that ship with a robot: in the folder ``weights`` beside the file of its class, or in that of the suite.
+
+Those of the suite were made by ``softgym fit --config <weights name>``.
+"""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+import sys
+from collections.abc import Iterable, Mapping
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from softgym_envs.errors import WeightsError
 from softgym_envs.robots.base import WITHOUT_CONTACT, Robot
+from softgym_envs.robots.registry import ROBOTS
 from softgym_envs.surrogate.model import SurrogateModel
 from softgym_envs.surrogate.weight_files import load_model
 
-_ROOT = Path(__file__).parent / "weights"
+_SUITE = Path(__file__).parent / "weights"
 
 
 def pretrained_folder(robot: Robot) -> Path:
     """Return the folder of a robot's shipped weights; its name ends in that of the mesh unless it is the published."""
     mesh = robot.mechanics_key.get("mesh")
-    return _ROOT / (robot.weights_name if mesh is None else f"{robot.weights_name}_{mesh}")
+    name = robot.weights_name if mesh is None else f"{robot.weights_name}_{mesh}"
+    folders = [folder / name for folder in _folders(cls.__module__ for cls in type(robot).__mro__[:-1])]
+    return next((folder for folder in folders if folder.is_dir()), folders[-1])
+
+
+def _folders(modules: Iterable[str]) -> list[Path]:
+    """Return the folders in which weights of robots may be: beside the files of modules, then those of the suite."""
+    found: dict[Path, None] = {}
+    for module in modules:
+        spec = sys.modules[module].__spec__ if module in sys.modules else find_spec(module)
+        if spec is not None and spec.origin is not None:  # a class of an interactive session has no file
+            found[Path(spec.origin).parent / "weights"] = None
+    return [*found, _SUITE]
 
 
 def ships_weights(robot: Robot) -> bool:
@@ -61,7 +79,7 @@ def pretrained_model(robot: Robot, weights: str | Path | None = None, members: i
         )
     folder = Path(weights) if weights is not None else pretrained_folder(robot)
     if weights is None and not folder.is_dir():
-        shipped = sorted(p.name for p in _ROOT.iterdir()) if _ROOT.is_dir() else []
+        shipped = list(shipped_robots())
         raise WeightsError(
             f"no weights ship for '{folder.name}': use backend='fem', or fit weights with 'softgym fit' and pass "
             f"backend_options={{'weights': folder}}; shipped: {', '.join(shipped) or 'none'}"
@@ -87,7 +105,8 @@ def standalone_model(robot: Robot, weights: str | Path | None = None, members: i
 def shipped_robots() -> dict[str, tuple[str, dict[str, Any]]]:
     """Return the names of all shipped weights, with the robot and the options they were trained for."""
     found = {}
-    for card in sorted(_ROOT.glob("*/model.json")):
-        config = json.loads(card.read_text())["config"]
-        found[card.parent.name] = (config["robot"], config["robot_options"])
-    return found
+    for folder in _folders(ROBOTS.place(name).partition(":")[0] for name in ROBOTS):
+        for card in folder.glob("*/model.json"):
+            config = json.loads(card.read_text())["config"]
+            found[card.parent.name] = (config["robot"], config["robot_options"])
+    return dict(sorted(found.items()))

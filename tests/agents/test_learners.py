@@ -8,18 +8,18 @@ import torch
 
 from softgym_envs.agents.config import EvolutionConfig, RecurrentConfig, TrainConfig
 from softgym_envs.agents.evaluation import evaluate, sample_goals
-from softgym_envs.agents.export import exported_spaces
 from softgym_envs.agents.learners import LEARNERS
 from softgym_envs.agents.learners.analytic import AnalyticLearner
 from softgym_envs.agents.learners.cloning import CloningLearner
-from softgym_envs.agents.learners.evolution import EvolutionLearner
 from softgym_envs.agents.learners.ppo import PPOLearner
-from softgym_envs.agents.learners.recurrent import RecurrentLearner
 from softgym_envs.agents.policy import Policy, read_tensors, save_policy
 from softgym_envs.agents.residual import BatchQP
 from softgym_envs.agents.training import CHECKPOINT, _restore, train
 from softgym_envs.errors import DataError, WeightsError
-from softgym_envs.robots.modular_arm import KINDS
+from softgym_envs.extensions.deployment.policy_onnx import exported_spaces
+from softgym_envs.extensions.learners.evolution import EvolutionLearner
+from softgym_envs.extensions.learners.recurrent import RecurrentLearner
+from softgym_envs.extensions.modules.modular_arm import KINDS
 from tests.agents.interruption import interrupted_at
 
 CONFIG = TrainConfig.model_validate(

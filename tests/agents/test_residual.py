@@ -133,9 +133,10 @@ def test_a_robot_without_a_surrogate_is_predicted_by_its_static_equilibrium():
 
 
 def test_unknown_baseline():
-    with pytest.raises(ValueError, match="agent = 'octopus' is unknown; allowed: qp, qp_static"):
+    with pytest.raises(ValueError, match="unknown agent 'octopus'; allowed: .*qp, .*qp_static"):
         make_baseline("octopus")
-    assert BASELINES == ("qp", "qp_static", "qp_model", "qp_pi", "qp_estimated", "close", "force", "random")
+    names = {"qp", "qp_static", "qp_model", "qp_pi", "qp_estimated", "close", "force", "random"}
+    assert names <= set(BASELINES)
 
 
 def test_the_qp_reaches_goals_together_as_it_reaches_each_alone():

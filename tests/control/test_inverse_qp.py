@@ -7,8 +7,10 @@ import pytest
 
 from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
-from softgym_envs.control import ContactQP, EmbeddedLoop, InverseQP, PICorrection
+from softgym_envs.control import InverseQP, PICorrection
 from softgym_envs.errors import ConvergenceError
+from softgym_envs.extensions.deployment import EmbeddedLoop
+from softgym_envs.extensions.grasping import ContactQP
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.solvers.complementarity import solve_complementarity
 

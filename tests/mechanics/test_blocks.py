@@ -10,14 +10,15 @@ from scipy.linalg import expm
 from scipy.sparse import coo_matrix
 from scipy.spatial.transform import Rotation
 
+from softgym_envs.extensions.modules import superelement
+from softgym_envs.extensions.modules.superelement import Superelement
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.point import Point
-from softgym_envs.mechanics.elements import averaged, beams, quadratic, superelement, tetrahedra
+from softgym_envs.mechanics.elements import averaged, beams, quadratic, tetrahedra
 from softgym_envs.mechanics.elements.averaged import AveragedTetrahedra
 from softgym_envs.mechanics.elements.beams import Beam, Section, are_folded
 from softgym_envs.mechanics.elements.block import ElementBlock, StrainRates
 from softgym_envs.mechanics.elements.quadratic import QuadraticTetrahedra, add_midside_nodes, split_triangles
-from softgym_envs.mechanics.elements.superelement import Superelement
 from softgym_envs.mechanics.elements.tetrahedra import Tetrahedra
 from softgym_envs.mechanics.frames import frame_rows
 from softgym_envs.mechanics.materials import MATERIALS

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from softgym_envs import make_robot
-from softgym_envs.control import HeldObject
-from softgym_envs.control.coupling import couple, rotate, tie_points
 from softgym_envs.errors import DesignError
+from softgym_envs.extensions.grasping import HeldObject
+from softgym_envs.extensions.grasping.control.coupling import couple, rotate, tie_points
 from softgym_envs.mechanics.frames import rotation_of
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.soft_finger import SoftFinger

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from softgym_envs import make_robot
-from softgym_envs.surrogate.baselines import thesis
-from softgym_envs.surrogate.baselines.perceptron import perceptron
+from softgym_envs.extensions.networks import thesis
+from softgym_envs.extensions.networks.perceptron import perceptron
 from softgym_envs.surrogate.calibration import reached
 from softgym_envs.surrogate.data.states import States
 from softgym_envs.surrogate.potential.model import Model

@@ -12,10 +12,11 @@ from scipy.optimize import nnls
 
 from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
-from softgym_envs.control import ContactControl, ContactQP, ForceGoal, InverseQP
+from softgym_envs.control import InverseQP
 from softgym_envs.control.inverse_qp import UNBOUNDED
-from softgym_envs.control.qpcc import ComplementarityQP
 from softgym_envs.errors import ConvergenceError
+from softgym_envs.extensions.grasping import ContactControl, ContactQP, ForceGoal
+from softgym_envs.extensions.grasping.control.qpcc import ComplementarityQP
 from softgym_envs.mechanics import CondensedModel
 from softgym_envs.mechanics.condensation import Row, point_rows
 from softgym_envs.mechanics.contact.obstacles import Cylinder, Plane

@@ -11,8 +11,9 @@ import numpy as np
 
 from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
-from softgym_envs.control import ContactControl, ContactQP, InverseQP
+from softgym_envs.control import InverseQP
 from softgym_envs.errors import ConvergenceError
+from softgym_envs.extensions.grasping import ContactControl, ContactQP
 from softgym_envs.mechanics.condensation import ContactModel, Row
 from tests.verification.contact_control import (
     Problem,

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from softgym_envs.extensions.modules.homogenisation import Cell, homogenise, lattice
+from softgym_envs.extensions.modules.orthotropic import Orthotropic
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.pose import Pose
-from softgym_envs.mechanics.homogenisation import Cell, homogenise, lattice
-from softgym_envs.mechanics.orthotropic import Orthotropic
 from softgym_envs.mechanics.solvers.statics import Statics
 
 WALLS = {"square, walls of 0.3": (0.3, 0.3), "walls of 0.2 and 0.5": (0.2, 0.5)}

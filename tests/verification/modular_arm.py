@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from softgym_envs.mechanics.elements.superelement import Superelement
+from softgym_envs.extensions.modules.modular_arm import ModularArm
+from softgym_envs.extensions.modules.superelement import Superelement
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.equilibrium import Equilibrium
-from softgym_envs.robots.modular_arm import ModularArm
 
 
 @dataclass(frozen=True)
@@ -61,9 +61,9 @@ class ExactArm:
     """
 
     def __init__(self, cells: Sequence[str], design: Mapping[str, float]) -> None:
+        from softgym_envs.extensions.modules import MODULES, learned_module
+        from softgym_envs.extensions.modules.modular_arm import CELLS
         from softgym_envs.mechanics.solvers.statics import Statics
-        from softgym_envs.robots.modular_arm import CELLS
-        from softgym_envs.robots.modules import MODULES, learned_module
 
         self.model = ModularArm(cells=cells).build(design)
         self.names = [CELLS[cell][0] for cell in cells]
@@ -77,7 +77,7 @@ class ExactArm:
 
     def energies(self, x: np.ndarray) -> list[Expanded]:
         """Return the energy of each module about a state with frames ``x`` (n, 3), its ports held where they are."""
-        from softgym_envs.robots.modules.states import MODULUS, in_strains
+        from softgym_envs.extensions.modules.states import MODULUS, in_strains
 
         found = []
         for part, block, axes in zip(self._parts, superelements(self.model), self._axes, strict=True):

@@ -160,6 +160,10 @@ class Task(ABC):
     hides_effector = False
     #: Whether the task reads whole mechanical states, which batched environments do not have.
     needs_state = False
+    #: Agents without training that the task is compared with.
+    agents: tuple[str, ...] = ("qp", "qp_model", "qp_pi", "random")
+    #: The agent that ``"qp"`` stands for; another one where an inverse QP on the effector cannot follow the goals.
+    qp_agent = "qp"
     #: Unit of goals; that of positions by default.
     goal_unit = "m"
     #: How people read distances; lengths by default.

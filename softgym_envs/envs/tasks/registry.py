@@ -15,10 +15,7 @@ TASKS = Registry(
     {
         "reach": "softgym_envs.envs.tasks.reach:Reach",
         "track": "softgym_envs.envs.tasks.track:Track",
-        "sensed_reach": "softgym_envs.envs.tasks.sensed_reach:SensedReach",
         "carry": "softgym_envs.envs.tasks.carry:Carry",
-        "grasp": "softgym_envs.envs.tasks.grasp:Grasp",
-        "lift": "softgym_envs.envs.tasks.lift:Lift",
     },
     base="softgym_envs.envs.tasks.base:Task",
     group="softgym_envs.tasks",

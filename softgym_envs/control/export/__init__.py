@@ -1,1 +1,0 @@
-"""Controllers as C source: condensed model, quadratic program and PI correction in one header."""

@@ -1,0 +1,1 @@
+"""Control of contacts and of coupled fingers."""

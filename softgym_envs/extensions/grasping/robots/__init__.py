@@ -1,0 +1,1 @@
+"""Contact-aided fingers and hands."""

@@ -1,0 +1,1 @@
+"""Learners beside those of the core: evolution strategies and recurrent policies."""

@@ -1,1 +1,0 @@
-"""Other surrogates, to compare with: the thesis' network, a residual network, radial basis functions."""
