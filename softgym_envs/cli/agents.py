@@ -1,4 +1,4 @@
-"""Verbs for agents: train, evaluate, results, deploy-policy."""
+"""Verbs for agents: train, evaluate, results."""
 
 from __future__ import annotations
 
@@ -153,27 +153,3 @@ def results(folder: Path | None, output: Path | None, curves: Path | None, as_js
         click.echo(f"wrote {output}")
     if curves is not None:
         click.echo(f"wrote {draw_curves(runs, curves)}")
-
-
-@click.command("deploy-policy")
-@click.argument("policy")
-@click.argument("files", nargs=-1, required=True, type=options.PATH)
-@click.option("--name", default="softgym_policy", show_default=True, help="Prefix of the names that a header defines.")
-def deploy_policy(policy: str, files: tuple[Path, ...], name: str) -> None:
-    """Write a policy as a C header or an ONNX graph.
-
-    POLICY is a file or the name of a shipped policy. FILES end with .h or .onnx. Both map sensor values in SI units to
-    commands.
-    """
-    from softgym_envs.extensions.deployment.policy_c import export_policy_c
-    from softgym_envs.extensions.deployment.policy_onnx import export_policy_onnx
-
-    for file in files:
-        if file.suffix not in (".h", ".onnx"):
-            raise ConfigError(f"'{file}' must end with .h or .onnx")
-    for file in files:
-        if file.suffix == ".h":
-            export_policy_c(policy, file, name=name)
-        else:
-            export_policy_onnx(policy, file)
-        click.echo(f"wrote {file}")

@@ -24,20 +24,17 @@ SECTIONS = {
     "Robots": {
         "show": "robots:show",
         "check": "check:check",
-        "export": "robots:export",
     },
     "Surrogates": {
         "dataset": "surrogates:dataset",
         "fit": "surrogates:fit",
         "fit-inertia": "surrogates:fit_inertia",
         "calibrate-trust": "surrogates:calibrate_trust",
-        "deploy": "surrogates:deploy",
     },
     "Agents": {
         "train": "agents:train",
         "evaluate": "agents:evaluate",
         "results": "agents:results",
-        "deploy-policy": "agents:deploy_policy",
     },
     "Design and control": {
         "demo": "demo:demo",

@@ -1,4 +1,4 @@
-"""Verbs for robots: show, export."""
+"""Verb for robots: show."""
 
 from __future__ import annotations
 
@@ -73,30 +73,3 @@ def show(robot: str, options_: tuple[str, ...], design: tuple[str, ...], picture
         with atomic_write(picture) as stream:
             Image.fromarray(render_body(body, chosen, size=(960, 960))).save(stream, "PNG")
         click.echo(f"wrote {picture}", err=as_json)
-
-
-@click.command()
-@click.argument("robot", shell_complete=options.complete_robot)
-@click.argument("files", nargs=-1, type=options.PATH)
-@options.robot_option
-@options.design
-@click.option("--moulds", type=options.PATH, help="Write the parts of a finger's mould to this folder.")
-def export(
-    robot: str, files: tuple[Path, ...], options_: tuple[str, ...], design: tuple[str, ...], moulds: Path | None
-) -> None:
-    """Write a body to STEP or STL files, or the moulds to cast it in.
-
-    FILES end with .step or .stl; all lengths are in millimetres.
-    """
-    from softgym_envs.extensions.deployment.cad import export_body
-    from softgym_envs.extensions.deployment.moulds import export_moulds
-
-    if not files and moulds is None:
-        raise ConfigError("nothing to write: pass a file ending with .step or .stl, or a folder with --moulds")
-    body = options.robot_of(robot, options_)
-    chosen = options.design_of(design)
-    written = [export_body(body, file, chosen) for file in files]
-    if moulds is not None:
-        written += export_moulds(body, moulds, chosen)
-    for path in written:
-        click.echo(f"wrote {path} (millimetres)")

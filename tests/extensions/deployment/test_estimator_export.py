@@ -13,8 +13,8 @@ import pytest
 from softgym_envs import make_robot
 from softgym_envs.backends.backend import PointForce
 from softgym_envs.backends.surrogate import SurrogateBackend
+from softgym_envs.extensions.deployment.estimator_c import export_estimator_c
 from softgym_envs.extensions.sensing import Noise, Readings, Touch, TouchGrid, finger_grid
-from softgym_envs.extensions.sensing.estimator_c import export_estimator_c
 from softgym_envs.extensions.sensing.learned import LearnedEstimator
 from softgym_envs.surrogate.domain import OUTSIDE, SPREAD, UNEXPLAINED
 
