@@ -46,7 +46,9 @@ LEVEL = {package: level for level, layer in enumerate(LAYERS) for package in lay
 # The viewer is imported only inside the functions that draw.
 LAZY = {("softgym_envs.envs", "softgym_envs.viewer"), ("softgym_envs.codesign", "softgym_envs.viewer")}
 # Metrics and files of the report that do not register themselves yet.
-UNREGISTERED = {("softgym_envs.codesign", f"softgym_envs.extensions.{x}") for x in ("grasping", "sensing", "deployment")}
+UNREGISTERED = {
+    ("softgym_envs.codesign", f"softgym_envs.extensions.{name}") for name in ("grasping", "sensing", "deployment")
+}
 HEAVY = ("torch", "gmsh", "stable_baselines3", "optuna", "rerun", "pyvista", "vtk", "numba", "scipy", "matplotlib")
 
 FILES = sorted(path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))

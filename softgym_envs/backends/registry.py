@@ -60,8 +60,8 @@ def make_backend(name: str, robot: Robot, **options: object) -> Backend:
     Raises:
         ValueError: for an unknown name or option.
     """
-    check_backend(name, robot, options)
     cls: Any = backend_class(name, robot)
+    check_options(f"backend '{name}'", cls, 1, options)
     made: Backend = cls(robot, **options)
     return made
 
