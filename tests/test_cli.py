@@ -32,9 +32,8 @@ def test_a_film_of_an_episode(softgym, tmp_path):
     assert status == 0 and f"wrote {film}" in out
     with Image.open(film) as frames:
         assert frames.size == (480, 480) and frames.n_frames > 5
-    for name, rest in ((film.with_suffix(".avi"), []), (film, ["--record", tmp_path / "a.rrd"])):
-        status, _, error = softgym("rollout", "SoftGym/FingerReach-v0", "--video", name, *rest)
-        assert status == 2 and ("must end with .gif" in error or "exclude each other" in error)
+    status, _, error = softgym("rollout", "SoftGym/FingerReach-v0", "--video", film.with_suffix(".avi"))
+    assert status == 2 and "must end with .gif" in error
 
 
 def test_rollout_evaluate_and_record(softgym, tmp_path):

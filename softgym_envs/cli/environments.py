@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import json
 import operator
@@ -74,6 +75,7 @@ def list_(as_json: bool) -> None:
 @click.option("--seed", default=0, show_default=True, help="Seed of the episode.")
 @click.option("--record", type=options.PATH, help="Write a rerun recording (.rrd) to this file.")
 @click.option("--video", type=options.PATH, help="Write a film (.mp4, .gif or .webp) to this file.")
+@click.option("--paraview", type=options.PATH, help="Write a time series for ParaView to this folder.")
 def rollout(
     environment: str,
     agent: str,
@@ -82,14 +84,15 @@ def rollout(
     seed: int,
     record: Path | None,
     video: Path | None,
+    paraview: Path | None,
 ) -> None:
     """Run one episode and print its result."""
     import softgym_envs  # noqa: F401 - registers the IDs
     from softgym_envs.agents.evaluation import check_agent, make_agent
     from softgym_envs.surrogate.domain import doubt_text
+    from softgym_envs.viewer.paraview import ParaviewWriter
+    from softgym_envs.viewer.recording import Filmed, Watcher, recorder_of, watch_rollout
 
-    if record is not None and video is not None:
-        raise ConfigError("--record and --video exclude each other; run the episode twice")
     if record is not None and record.suffix != ".rrd":
         raise ConfigError(f"recording '{record}' must end with .rrd; --video writes films")
     if video is not None:
@@ -102,22 +105,19 @@ def rollout(
     act = make_agent(agent, seed)
     drawn = {"render_mode": "rgb_array"} if video is not None else {}
     env = config.make(**({"design": chosen} if chosen else {}), **drawn)
-    if record is not None:
-        from softgym_envs.viewer.recording import record_rollout
-
-        summary = record_rollout(env, act, record, seed=seed)
-        total, step, doubts = summary["return"], summary["steps"], summary["doubts"]
-        info = {"distance": summary["final_distance"], "is_success": summary["success"]}
-    else:
-        observation, info = env.reset(seed=seed)
-        total, step, ended, doubts = 0.0, 0, False, [int(info["doubt"])]
-        frames: list[Any] = [env.render()] if video is not None else []
-        while not ended:
-            observation, reward, terminated, truncated, info = env.step(act(observation, env.unwrapped))
-            total, step, ended = total + float(reward), step + 1, terminated or truncated
-            doubts.append(int(info["doubt"]))
-            if video is not None:
-                frames.append(env.render())
+    frames: list[Any] = []
+    with contextlib.ExitStack() as open_files:
+        watchers: list[Watcher] = []
+        if record is not None:
+            watchers.append(open_files.enter_context(recorder_of(env, record)))
+        if paraview is not None:
+            robot = env.unwrapped.robot  # type: ignore[attr-defined]
+            watchers.append(open_files.enter_context(ParaviewWriter(robot, paraview)))
+        if video is not None:
+            watchers.append(Filmed(env, frames))
+        summary = watch_rollout(env, act, watchers, seed=seed)
+    total, step, doubts = summary["return"], summary["steps"], summary["doubts"]
+    info = {"distance": summary["final_distance"], "is_success": summary["success"]}
     click.echo(f"{environment} on {config.backend}, agent {agent}: {counted(step, 'step')}, return {total:.2f}")
     scale = config.task_class.distance_scale
     click.echo(f"final {scale.name} {scale.text(info['distance'], 3)}, success {info['is_success']}")
@@ -130,6 +130,8 @@ def rollout(
         click.echo(f"wrote {video}")
     if record is not None:
         click.echo(f"wrote {record}; open it with 'softgym view {record}'")
+    if paraview is not None:
+        click.echo(f"wrote {paraview}; open its .pvd files with ParaView")
     env.close()
 
 

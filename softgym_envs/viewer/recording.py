@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, Protocol
 
 import gymnasium
 import numpy as np
@@ -237,10 +237,19 @@ def record_rollout(
     Raises:
         ValueError: if the environment is not a `SoftRobotEnv`, or has no time limit while ``steps`` is None.
     """
+    with recorder_of(env, path) as recorder:
+        return watch_rollout(env, agent, [recorder], seed=seed, options=options, steps=steps)
+
+
+def recorder_of(env: gymnasium.Env, path: str | Path) -> RolloutRecorder:
+    """Return a recorder of an environment's rollouts, to be used as a context manager.
+
+    Raises:
+        ValueError: if the environment is not a `SoftRobotEnv`.
+    """
     name = Path(path).stem if env.spec is None else env.spec.id
     body = _body_of(env)
-    with RolloutRecorder(body.robot, path, name=name, distance_scale=body.task.distance_scale) as recorder:
-        return _roll_out(recorder, env, agent, seed, options, _limit(env, steps))
+    return RolloutRecorder(body.robot, path, name=name, distance_scale=body.task.distance_scale)
 
 
 def _body_of(env: gymnasium.Env) -> SoftRobotEnv:
@@ -257,22 +266,57 @@ def _limit(env: gymnasium.Env, steps: int | None) -> int:
     return limit
 
 
-def _roll_out(
-    recorder: RolloutRecorder,
+class Watcher(Protocol):
+    """Takes the states of a rollout, as `RolloutRecorder.log` describes."""
+
+    def log(
+        self,
+        step: int,
+        design: Mapping[str, float],
+        state: State,
+        goal: np.ndarray,
+        *,
+        path: np.ndarray | None = None,
+        reward: float | None = None,
+        distance: float | None = None,
+    ) -> None: ...
+
+
+class Filmed:
+    """Watcher that keeps a picture of each state.
+
+    Args:
+        env: environment with ``render_mode="rgb_array"``.
+        frames: list that takes the pictures, shape (height, width, 3).
+    """
+
+    def __init__(self, env: gymnasium.Env, frames: list[Any]) -> None:
+        self.env, self.frames = env, frames
+
+    def log(self, step: int, design: Mapping[str, float], state: State, goal: np.ndarray, **shown: Any) -> None:
+        """Draw the environment as it is now."""
+        self.frames.append(self.env.render())
+
+
+def watch_rollout(
     env: gymnasium.Env,
     agent: Agent,
-    seed: int | None,
-    options: Mapping[str, Any] | None,
-    steps: int,
+    watchers: Sequence[Watcher],
+    *,
+    seed: int | None = 0,
+    options: Mapping[str, Any] | None = None,
+    steps: int | None = None,
 ) -> dict[str, Any]:
-    """Run one episode into an open recording."""
+    """Run one episode, show each of its states to all watchers and return its result; see `record_rollout`."""
+    steps = _limit(env, steps)
     body = _body_of(env)
     observation, info = env.reset(seed=seed, options=None if options is None else dict(options))
 
     def log(step: int, reward: float | None) -> None:
         path, goal = body.task.drawn_goals(body.state, body.path, body.goal)
         distance = float(info["distance"])
-        recorder.log(step, body.design, body.state, goal, path=path, reward=reward, distance=distance)
+        for watcher in watchers:
+            watcher.log(step, body.design, body.state, goal, path=path, reward=reward, distance=distance)
 
     log(0, None)
     total, step, over, doubts = 0.0, 0, False, [int(info["doubt"])]
