@@ -205,8 +205,6 @@ _MODULES = {
         *("bending_angle", "angular_displacement", "contact_force", "normal_force", "grasp_resistance", "travel"),
         *("manipulability", "tip_stiffness", "effort", "work"),
     ),
-    "sensors": ("volume_change", "relative_volume_change", "cavity_volume", "pressure_sensitivity", "information"),
-    "grasps": ("grip_force", "grip_resistance", "grip_energy"),
 }
 METRICS: Mapping[str, Metric] = _Metrics(
     "metric",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from softgym_envs.codesign.report.episodes import Episode
 from softgym_envs.codesign.report.results import StudyResults
 from softgym_envs.codesign.snapshot import StudySnapshot
 from softgym_envs.errors import SoftGymError
+from softgym_envs.registry import Table
 from softgym_envs.robots.base import Robot
 
 EMBEDDED = 1_000_000
@@ -43,10 +44,37 @@ class Download:
     href: str
 
 
+@dataclass(frozen=True)
+class Winner:
+    """What files of the winner are made of: its robot and design, its policy if it has one, episodes at test goals."""
+
+    robot: Robot
+    design: Mapping[str, float]
+    policy: Path | None
+    episodes: Sequence[Episode]
+
+
+@dataclass(frozen=True)
+class WinnerFile:
+    """A file that a report can write of its winner.
+
+    Attributes:
+        ending: of its name, which says what it holds: ``".stl"``.
+        text: what it is.
+        write: writes it to a path.
+        exists: whether a winner has such a file.
+    """
+
+    ending: str
+    text: str
+    write: Callable[[Path, Winner], object]
+    exists: Callable[[Winner], bool] = lambda winner: True
+
+
 def write_exports(
     snapshot: StudySnapshot, results: StudyResults, episodes: Sequence[Episode]
 ) -> tuple[list[Download], list[str]]:
-    """Write the files of the winner: ``winner-trialNNNN.stl``, ``.step``, ``.onnx``, ``.gif`` and ``.rrd``.
+    """Write the files of the winner (`WINNER_FILES`): ``winner-trialNNNN.gif``, ``.rrd`` and others.
 
     Existing files are kept; another winner has other files.
 
@@ -58,41 +86,21 @@ def write_exports(
         return [_download(folder, name, text) for name, text in TABLES.items()], []
     robot = snapshot.config.environment_of(winner.options).make_robot()
     policy = policy_file(snapshot, winner)
+    shown = Winner(robot, winner.design, policy, episodes)
     stem = f"winner-trial{winner.trial:04d}"
-    files: list[tuple[str, str, Callable[[Path], object]]] = [
-        (
-            ".stl",
-            "the winner's body at rest as triangles, in millimetres",
-            lambda path: _body(robot, path, winner.design),
-        ),
-        (".step", "its exact shape for CAD, in millimetres", lambda path: _body(robot, path, winner.design)),
-    ]
-    if policy is not None:
-        files.append(
-            (".onnx", "its policy as an ONNX graph, from sensor values to commands", lambda path: _onnx(policy, path))
-        )
-    if episodes:
-        files.append((".gif", "baseline and winner at one test goal", lambda path: write_film(path, episodes)))
-    # Bodies with different options of the robot do not share a recording.
-    if len(episodes) == 2 and episodes[0].robot.mechanics_key == episodes[1].robot.mechanics_key:
-        files.append(
-            (
-                ".rrd",
-                f"the same with all plots; open it with: softgym view {stem}.rrd",
-                lambda path: _record(path, episodes),
-            )
-        )
     downloads, missing = [], []
-    for ending, text, write in files:
-        path = folder / f"{stem}{ending}"
+    for file in WINNER_FILES.values():
+        if not file.exists(shown):
+            continue
+        path = folder / f"{stem}{file.ending}"
         try:
             if not path.exists():
-                write(path)
+                file.write(path, shown)
         except Exception as error:  # no exact shape, no ONNX, no OpenGL: the report is useful without the file
             expected = isinstance(error, (SoftGymError, ValueError))  # their messages say all
             missing.append(f"Not written: {path.name}: {'' if expected else f'{type(error).__name__}: '}{error}")
         else:
-            downloads.append(_download(folder, path.name, text))
+            downloads.append(_download(folder, path.name, file.text))
     if policy is not None:
         text = "its policy; softgym evaluate and softgym rollout --agent take it together with the .json beside it"
         downloads.append(_download(folder, policy.relative_to(folder).as_posix(), text))
@@ -105,18 +113,6 @@ def _download(folder: Path, name: str, text: str) -> Download:
         return Download(name, text, size, name)
     content = base64.b64encode((folder / name).read_bytes()).decode()
     return Download(name, text, size, f"data:application/octet-stream;base64,{content}")
-
-
-def _body(robot: Robot, path: Path, design: dict[str, float]) -> None:
-    from softgym_envs.extensions.deployment.cad import export_body
-
-    export_body(robot, path, design)
-
-
-def _onnx(policy: Path, path: Path) -> None:
-    from softgym_envs.extensions.deployment.policy_onnx import export_policy_onnx
-
-    export_policy_onnx(policy, path)
 
 
 def write_film(path: Path, episodes: Sequence[Episode]) -> None:
@@ -164,3 +160,25 @@ def _record(path: Path, episodes: Sequence[Episode]) -> None:
                     reward=episode.rewards[step],
                     distance=episode.distances[step],
                 )
+
+
+def _comparable(winner: Winner) -> bool:
+    """Whether baseline and winner share a recording: bodies with different options of the robot do not."""
+    keys = [episode.robot.mechanics_key for episode in winner.episodes]
+    return len(keys) == 2 and keys[0] == keys[1]
+
+
+FILM = WinnerFile(
+    ".gif",
+    "baseline and winner at one test goal",
+    lambda path, winner: write_film(path, winner.episodes),
+    lambda winner: bool(winner.episodes),
+)
+RECORDING = WinnerFile(
+    ".rrd",
+    "the same with all plots; open it with: softgym view FILE",
+    lambda path, winner: _record(path, winner.episodes),
+    _comparable,
+)
+WINNER_FILES = Table("file of the winner", {"film": FILM, "recording": RECORDING}, group="softgym_envs.winner_files")
+"""Files of the winner by what they are: those of the report itself and of installed packages, each a `WinnerFile`."""

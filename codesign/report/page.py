@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from softgym_envs.codesign.report.results import StudyResults
 from softgym_envs.codesign.report.sentences import KeyFigure
 from softgym_envs.codesign.snapshot import StudySnapshot, load_study
 from softgym_envs.errors import SoftGymError
+from softgym_envs.registry import Table
 from softgym_envs.storage import atomic_write
 from softgym_envs.wording import counted
 
@@ -82,6 +83,23 @@ class TransferSection:
 
 
 @dataclass(frozen=True)
+class ReportSection:
+    """A section that an installed package adds to reports.
+
+    Attributes:
+        title: its heading.
+        write: returns its HTML for a study; empty for a study that it has nothing to say about.
+    """
+
+    title: str
+    write: Callable[[StudySnapshot, StudyResults], str]
+
+
+SECTIONS = Table("section of the report", {}, group="softgym_envs.report_sections")
+"""Sections of installed packages by name, each a `ReportSection`; they stand before the list of files."""
+
+
+@dataclass(frozen=True)
 class Page:
     """Everything that the template ``report.html.j2`` shows, in its order."""
 
@@ -98,6 +116,7 @@ class Page:
     search: SearchSection
     transfer: TransferSection
     cost: list[tables.CostRow]
+    sections: list[tuple[str, Markup]]
     downloads: list[Download]
     not_written: list[str]
     rerun: list[tuple[str, str]]
@@ -136,6 +155,7 @@ def _page(snapshot: StudySnapshot, results: StudyResults) -> Page:
     except SoftGymError as error:  # the report is useful without them
         failed = [f"The episodes of baseline and winner cannot be shown: {error}"]
     downloads, missing = write_exports(snapshot, results, episodes)
+    added = [(section.title, section.write(snapshot, results)) for section in SECTIONS.values()]
     trial_columns, trials = tables.trial_table(snapshot, results)
     return Page(
         results=results,
@@ -151,6 +171,7 @@ def _page(snapshot: StudySnapshot, results: StudyResults) -> Page:
         search=_search_section(snapshot, results),
         transfer=_transfer_section(snapshot, results),
         cost=tables.cost_rows(results.cost),
+        sections=[(title, Markup(html)) for title, html in added if html],
         downloads=downloads,
         not_written=[*missing, *failed],
         rerun=sentences.rerun(snapshot, results),

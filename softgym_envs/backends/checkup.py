@@ -289,9 +289,7 @@ def _commands(
 # -- designs ------------------------------------------------------------------------------------------------------
 
 
-def _box(
-    robot: Robot, rng: np.random.Generator, bodies: int, rests: dict[tuple[str, float], Equilibrium]
-) -> Finding:
+def _box(robot: Robot, rng: np.random.Generator, bodies: int, rests: dict[tuple[str, float], Equilibrium]) -> Finding:
     """Build the bounds of each variable and random corners; keep the states at rest of the bounds."""
     space = robot.design_space
     names = [variable.name for variable in space]

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from softgym_envs import make_robot
-from softgym_envs.codesign.metrics.grasps import GraspConfig
 from softgym_envs.codesign.tools.bodies import Evaluator
 from softgym_envs.codesign.tools.config import OptimiseConfig, SensitivityConfig
 from softgym_envs.codesign.tools.evaluation import evaluate
 from softgym_envs.config import load_config
 from softgym_envs.errors import ConfigError, ConvergenceError, InfeasibleDesign
+from softgym_envs.extensions.grasping.metrics import GraspConfig
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs" / "design"
 COARSE = {"mesh_size": 0.04, "control_points": 7}
@@ -44,7 +44,7 @@ def test_scene_of_a_grasp(finger, monkeypatch):
         seen.append((target, options))
         return grasp_of()
 
-    monkeypatch.setattr("softgym_envs.codesign.metrics.grasps.evaluate_grasp", record)
+    monkeypatch.setattr("softgym_envs.extensions.grasping.metrics.evaluate_grasp", record)
     GraspConfig(kind="sphere", distance=0.02, height=0.07, size=0.04, friction=0.3, angles=7).evaluate(finger, {})
     (target, options) = seen[0]
     assert (target.kind, target.distance, target.height, target.size, target.friction) == (
@@ -59,7 +59,7 @@ def test_scene_of_a_grasp(finger, monkeypatch):
 
 @pytest.mark.parametrize(("status", "error"), [("infeasible", InfeasibleDesign), ("no equilibrium", ConvergenceError)])
 def test_failed_grasps_are_infeasible_evaluations(finger, monkeypatch, status, error):
-    monkeypatch.setattr("softgym_envs.codesign.metrics.grasps.evaluate_grasp", lambda *a, **b: grasp_of(status))
+    monkeypatch.setattr("softgym_envs.extensions.grasping.metrics.evaluate_grasp", lambda *a, **b: grasp_of(status))
     with pytest.raises(error, match="why"):
         GraspConfig().evaluate(finger, {})
     found = evaluate(Evaluator(finger, ["grip_force"]), finger.design_space.baseline)
