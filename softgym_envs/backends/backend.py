@@ -178,12 +178,14 @@ class Backend(ABC):
         takes_force: `step` takes a force on the effector.
         takes_touch: `touch` takes a force on a point of the body.
         cable_friction: coefficient of friction of cables on their guides, 0 where they are not computed.
+        cable_compliance: how far cables stretch per tension [m/N], 0 where that is not computed.
     """
 
     moving: bool = False
     takes_force: bool = False
     takes_touch: bool = False
     cable_friction: float = 0.0
+    cable_compliance: Any = 0.0
     robot: Robot
     design: Design
     state: State

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -23,6 +23,7 @@ from softgym_envs.mechanics.solvers.schemes import SCHEMES
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import TOUCH_RADIUS, Robot
 from softgym_envs.surrogate.domain import FOLDED, LOADED, SOFT, SPREAD
+from softgym_envs.wording import counted
 
 
 def _relax_dynamically(model: MechanicalModel, statics: Statics, command: np.ndarray, mode: str) -> Equilibrium:
@@ -52,6 +53,8 @@ class FEMBackend(Backend):
         mass_damping: Rayleigh's alpha [1/s].
         stiffness_damping: Rayleigh's beta [s].
         cable_friction: coefficient of friction of cables on their guides; in statics only.
+        cable_compliance: how far cables stretch per tension [m/N], one number or one for each actuator; in statics
+            without contact only.
 
     Attributes:
         model: the present body.
@@ -76,6 +79,7 @@ class FEMBackend(Backend):
         mass_damping: float = 0.0,
         stiffness_damping: float = 0.01,
         cable_friction: float = 0.0,
+        cable_compliance: float | Sequence[float] = 0.0,
     ) -> None:
         if not isinstance(dynamics, bool):
             raise ValueError(f"dynamics = {dynamics!r} is unknown; allowed: True, False")
@@ -94,6 +98,7 @@ class FEMBackend(Backend):
         self.largest_efforts = np.array([actuator.max_effort for actuator in robot.actuators])
         self._limited = bool(np.isfinite(self.largest_efforts).any())
         self._friction = self._checked_friction(cable_friction)
+        self._compliance = self._checked_compliance(cable_compliance)
         self.design = None  # type: ignore[assignment]  # until the first reset
         self.reset(robot.design_space.complete(design))
 
@@ -107,6 +112,7 @@ class FEMBackend(Backend):
         if complete != self.design:
             model = self.robot.build(complete)
             self._set_friction(model)
+            self._set_compliance(model)
             statics = self._solver(model)
             zero = np.zeros(len(self.robot.actuators))
             try:
@@ -153,6 +159,43 @@ class FEMBackend(Backend):
             raise
         self._rest = replace(self._rest, memory=self._statics.memory)
         self.restore(self._rest)
+
+    @property
+    def cable_compliance(self) -> np.ndarray:
+        """How far each cable stretches per tension [m/N], shape (n_a,); another one applies from the next step."""
+        return self._compliance
+
+    @cable_compliance.setter
+    def cable_compliance(self, compliance: float | Sequence[float] | np.ndarray) -> None:
+        compliance = self._checked_compliance(compliance)
+        if np.array_equal(compliance, self._compliance):
+            return
+        self._compliance = compliance
+        self._set_compliance(self.model)
+        self._statics.compliance[: len(compliance)] = compliance
+
+    def _checked_compliance(self, compliance: float | Sequence[float] | np.ndarray) -> np.ndarray:
+        try:
+            values = np.broadcast_to(np.asarray(compliance, dtype=float), (len(self.robot.actuators),)).copy()
+        except ValueError:
+            raise ValueError(
+                f"cable_compliance = {compliance!r} must be one number or one for each of "
+                f"{counted(len(self.robot.actuators), 'actuator')} [m/N]"
+            ) from None
+        if not (np.isfinite(values) & (values >= 0.0)).all():
+            raise ValueError(f"cable_compliance = {compliance!r} must be finite and not negative")
+        if values.any() and (self.moving or self.robot.touches):
+            raise ValueError("cable_compliance is computed in statics without contact only; allowed here: 0")
+        return values
+
+    def _set_compliance(self, model: MechanicalModel) -> None:
+        """Set how far the model's cables stretch, beyond what is part of the robot."""
+        if not self._compliance.any():
+            return
+        for constraint, value in zip(model.constraints["a"], self._compliance, strict=True):
+            if value and not isinstance(constraint, Cable):
+                raise ValueError(f"cable_compliance: actuator '{constraint.name}' of '{self.robot.name}' is no cable")
+            constraint.compliance = float(value)
 
     def _solver(self, model: MechanicalModel) -> Statics:
         """Return the static solver of a body."""

@@ -130,7 +130,12 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         self.action_space = self.spaces.action_space
         self.observation_space = self.spaces.observation_space
         self._plants = setup.plants
-        self._fixed_plant = self.plant = Plant(cable_friction=self.backend.cable_friction)  # unless there are `_plants`
+        stretch = np.atleast_1d(self.backend.cable_compliance)
+        own = Plant(
+            cable_friction=self.backend.cable_friction,
+            cable_compliance=tuple(map(float, stretch)) if stretch.any() else 0.0,
+        )
+        self._fixed_plant = self.plant = own  # unless there are `_plants`
         self._sent = np.zeros((0, len(self.robot.actuators)))
         self._sensed: Sensed | None = None
         self._renderer: Any = None
@@ -222,9 +227,12 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
     def _begin_plant(self) -> None:
         """Choose the plant of an episode, at rest."""
         self.plant = self._fixed_plant if self._plants is None else self._plants.sample(self.np_random)
-        self._sent = np.zeros((self.plant.delay, len(self.robot.actuators)))
+        # The commands that have not arrived yet; and the last one, if the drives did something else.
+        kept = self.plant.delay + (not self.plant.drives_exactly)
+        self._sent = np.zeros((kept, len(self.robot.actuators)))
         self._sensed = None
         self.backend.cable_friction = self.plant.cable_friction
+        self.backend.cable_compliance = self.plant.cable_compliance
 
     def _show(self, design: Design) -> None:
         self._unit_design = self.design_space.observe(design.array, self.spaces.design_names)
@@ -268,6 +276,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             if theirs != mine:
                 raise ValueError(f"the state belongs to a {option} = {theirs:.80}, but the environment has {mine:.80}")
         self.backend.cable_friction = state.plant.cable_friction
+        self.backend.cable_compliance = state.plant.cable_compliance
         self.backend.resume(state.physics)
         self.plant, self._sent, self._sensed = state.plant, state.sent.copy(), state.sensed
         self._show(self.backend.design)
@@ -322,7 +331,8 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         command = self.spaces.command(action, self.command)
         if len(self._sent):
             waiting = np.vstack([self._sent, command])
-            command, self._sent = waiting[0], waiting[1:]
+            command, self._sent = waiting[-1 - self.plant.delay], waiting[1:]
+        command = self.plant.drive(command, self.backend.state.command)
         converged = True
         if self.task.touches:
             self.backend.touch(self.plant.touch_on_model(self.task.touch(self._step)))
@@ -358,7 +368,8 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             **_mechanics(state),
         }
         if self._plants is not None:
-            info |= {f"plant_{name}": value for name, value in asdict(self.plant).items()}
+            for name, value in asdict(self.plant).items():
+                info[f"plant_{name}"] = np.array(value) if isinstance(value, tuple) else value
         velocity = state.velocity[0] if self.spaces.moving else None
         shown = self._sensed or true
         sensors = self._sensor_values(squash(shown.sensors), sense) if self.task.sensors else None

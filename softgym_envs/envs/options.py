@@ -49,7 +49,7 @@ class EnvironmentOptions:
     robot_options: Mapping[str, Any] | None = None
     task_options: Mapping[str, Any] | None = None
     backend_options: Mapping[str, Any] | None = None
-    plant: Mapping[str, float | Sequence[float]] | None = None
+    plant: Mapping[str, Any] | None = None
     defaults: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
@@ -107,6 +107,8 @@ class Setup:
     @property
     def batched(self) -> bool:
         """Whether `SoftRobotVectorEnv` can step many of these environments together."""
+        if self.plants is not None and not self.plants.drive_exactly:
+            return False
         return not _what_batches_lack(self.task) and is_batched(self.backend, self.robot, self.backend_options)
 
     def spaces(self, *, moving: bool = False) -> AgentSpaces:
@@ -151,8 +153,11 @@ def set_up(robot: RobotSource | None, task: TaskSource, backend: str | None, opt
     check_backend(backend, made, backend_options)
     space = made.design_space
     plant = defaults.get("plant") if options.plant is None else options.plant
-    if plant and "cable_friction" in backend_options:
-        plant = {"cable_friction": backend_options["cable_friction"], **plant}
+    if plant:
+        plant = {name: backend_options[name] for name in ("cable_friction",) if name in backend_options} | {**plant}
+        if "cable_compliance" in backend_options and "cable_compliance" not in plant:
+            stretch = np.broadcast_to(backend_options["cable_compliance"], (len(made.actuators),)).tolist()
+            plant["cable_compliance"] = dict(zip((a.name for a in made.actuators), stretch, strict=True))
     return Setup(
         robot=made,
         task=make_task(task, made, **{**defaults.get("task_options", {}), **(options.task_options or {})}),

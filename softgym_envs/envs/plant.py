@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
@@ -25,12 +25,31 @@ class Plant:
         delay: control steps between sending a command and its arrival at the drives.
         noise: standard deviation of all sensors: of displacements over their range, of efforts and of sensor rows over
             their scale, of effectors over the robot's size, of measured forces over the largest wanted one.
+        gain: what each drive does over what it is commanded to, one number or one for each actuator, as all below.
+        offset: what it adds to that [m, ...].
+        backlash: width of its play [m, ...]: it stays where it is while the command is within half of it.
+        cable_compliance: how far each cable stretches per tension [m/N]; finite elements without contact only.
     """
 
     stiffness: float = 1.0
     cable_friction: float = 0.0
     delay: int = 0
     noise: float = 0.0
+    gain: float | tuple[float, ...] = 1.0
+    offset: float | tuple[float, ...] = 0.0
+    backlash: float | tuple[float, ...] = 0.0
+    cable_compliance: float | tuple[float, ...] = 0.0
+
+    @property
+    def drives_exactly(self) -> bool:
+        """Whether drives do what they are commanded to."""
+        return not (np.any(np.asarray(self.gain) != 1.0) or np.any(self.offset) or np.any(self.backlash))
+
+    def drive(self, command: np.ndarray, last: np.ndarray) -> np.ndarray:
+        """Return what the drives do under a command (n_a,) after they did ``last`` (n_a,)."""
+        if self.drives_exactly:
+            return command
+        return play(self.gain * command + self.offset, last, np.asarray(self.backlash))
 
     def touch_on_model(self, load: PointForce | None) -> PointForce | None:
         """Return the force that deforms the model as a force on the plant deforms the plant.
@@ -42,8 +61,25 @@ class Plant:
         return replace(load, force=load.force / self.stiffness)
 
 
-LIMITS = {"stiffness": (0.1, 10.0), "cable_friction": (0.0, 5.0), "delay": (0, 100), "noise": (0.0, 1.0)}
+def play(command: np.ndarray, last: np.ndarray, width: np.ndarray) -> np.ndarray:
+    """Return where a drive with play ends up that was at ``last``: nowhere else if the command is within half of it."""
+    return np.clip(last, command - 0.5 * width, command + 0.5 * width)
+
+
+LIMITS: dict[str, tuple[float, float]] = {
+    "stiffness": (0.1, 10.0),
+    "cable_friction": (0.0, 5.0),
+    "delay": (0, 100),
+    "noise": (0.0, 1.0),
+    "gain": (0.1, 10.0),
+    "offset": (-10.0, 10.0),
+    "backlash": (0.0, 10.0),
+    "cable_compliance": (0.0, 1.0),
+}
 """Smallest and largest value of each attribute of a plant."""
+
+OF_DRIVES = ("gain", "offset", "backlash", "cable_compliance")
+"""Attributes that may have one value for each actuator."""
 
 
 @dataclass(frozen=True)
@@ -60,9 +96,11 @@ class Plants:
 
     @classmethod
     def check(
-        cls, option: Mapping[str, float | Sequence[float]] | None, robot: Robot, backend: str, *, moving: bool = False
+        cls, option: Mapping[str, Any] | None, robot: Robot, backend: str, *, moving: bool = False
     ) -> Plants | None:
         """Return the plants of the option ``plant``: a number or a range for each attribute. None without the option.
+
+        What the drives do may differ: ``{"offset": {"cable_1": 0.001, "cable_2": [0.0, 0.002]}}`` by actuator.
 
         Args:
             option: the option.
@@ -81,10 +119,15 @@ class Plants:
         for name, given in option.items():
             if name not in names:
                 raise ValueError(unknown_name("plant option", name, names))
-            low[name], high[name] = _ends(name, given)
+            if name in OF_DRIVES and isinstance(given, Mapping):
+                low[name], high[name] = _ends_by_actuator(name, given, robot)
+            else:
+                low[name], high[name] = _ends(name, given)
         found = cls(replace(Plant(), **low), replace(Plant(), **high))
         if found.high.cable_friction and backend != "fem":
             raise ValueError(f"plant cable_friction needs backend 'fem': '{backend}' has no friction of cables")
+        if np.any(found.high.cable_compliance) and (backend != "fem" or robot.touches or moving):
+            raise ValueError("plant cable_compliance needs backend 'fem' without contact and dynamics; allowed: 0")
         stiff = found.low.stiffness == found.high.stiffness == 1.0
         limited = any(np.isfinite(actuator.max_effort) for actuator in robot.actuators)
         if not stiff and (any(robot.gravity) or robot.touches or robot.sealed or limited):
@@ -99,6 +142,12 @@ class Plants:
         return found
 
     @property
+    def drive_exactly(self) -> bool:
+        """Whether the drives of all plants do what they are commanded to, with cables that do not stretch."""
+        ends = (self.low, self.high)
+        return all(plant.drives_exactly and not np.any(plant.cable_compliance) for plant in ends)
+
+    @property
     def longest_delay(self) -> int:
         """Largest number of control steps that a command may take."""
         return self.high.delay
@@ -110,6 +159,8 @@ class Plants:
             high = getattr(self.high, name)
             if low == high:
                 values[name] = low
+            elif isinstance(low, tuple):
+                values[name] = tuple(float(value) for value in rng.uniform(low, high))
             else:
                 values[name] = int(rng.integers(low, high + 1)) if name == "delay" else float(rng.uniform(low, high))
         return Plant(**values)
@@ -130,6 +181,22 @@ class Sensed:
     effort: np.ndarray
     effector: np.ndarray
     sensors: np.ndarray = field(default_factory=lambda: np.zeros(0))
+
+
+def _ends_by_actuator(
+    name: str, given: Mapping[str, object], robot: Robot
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return the smallest and largest values of an attribute given by actuator; the others have its default.
+
+    Raises:
+        ValueError: as `_ends`, and for an unknown actuator.
+    """
+    names = [actuator.name for actuator in robot.actuators]
+    for actuator in given:
+        if actuator not in names:
+            raise ValueError(f"plant {name}: {unknown_name('actuator', actuator, names)}")
+    ends = [_ends(name, given.get(actuator, getattr(Plant, name))) for actuator in names]
+    return tuple(low for low, _ in ends), tuple(high for _, high in ends)
 
 
 def _ends(name: str, given: object) -> tuple[float, float]:

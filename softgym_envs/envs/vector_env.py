@@ -29,7 +29,7 @@ from softgym_envs.envs.options import (
     set_up,
     take_reset_mask,
 )
-from softgym_envs.envs.plant import Sensed, sensed
+from softgym_envs.envs.plant import OF_DRIVES, Plant, Sensed, sensed
 from softgym_envs.envs.tasks.base import check_drawn
 from softgym_envs.errors import InfeasibleDesign
 from softgym_envs.mechanics.condensation import CondensedModel
@@ -114,6 +114,8 @@ class SoftRobotVectorEnv(VectorEnv):
         self._plants = setup.plants
         if setup.plants is not None and setup.plants.high.cable_friction:
             raise ValueError("plant cable_friction is not available together for many bodies; allowed: 0")
+        if setup.plants is not None and not setup.plants.drive_exactly:
+            raise ValueError(f"plant {', '.join(OF_DRIVES)}: not available together for many bodies; allowed: defaults")
         self._stiffness, self._noise = np.ones((num_envs, 1)), np.zeros(num_envs)
         self._delay = np.zeros(num_envs, dtype=np.int64)
         longest = 0 if setup.plants is None else setup.plants.longest_delay
@@ -424,5 +426,6 @@ class SoftRobotVectorEnv(VectorEnv):
             zero = np.zeros(self.num_envs)
             info |= {"plant_stiffness": self._stiffness[:, 0].copy(), "plant_cable_friction": zero}
             info |= {"plant_delay": self._delay.copy(), "plant_noise": self._noise.copy()}
+            info |= {f"plant_{name}": np.full(self.num_envs, getattr(Plant, name)) for name in OF_DRIVES}
         info |= {f"_{name}": every for name in tuple(info)}
         return info, reward

@@ -107,6 +107,65 @@ def test_friction_on_finite_elements(actions):
     np.testing.assert_allclose(again[-1]["effector"], infos[-1]["effector"], atol=1e-9)
 
 
+def test_drives_that_do_something_else(actions):
+    """Gain, offset and play: the body does what the drives do, and commands go on from what was commanded."""
+    plant = {"gain": 0.9, "offset": {"cable_2": 0.001}, "backlash": 0.002}
+    env, exact = gymnasium.make(FINGER, plant=plant), gymnasium.make(FINGER)
+    goal = {"options": {"goal": np.array([0.0, 0.04, -0.1])}}
+    commands, infos = [], []
+    for made in (env, exact):
+        made.reset(seed=0, **goal)
+    there = np.zeros(2)
+    for action in [*np.ones((8, 2)), *actions, *-np.ones((9, 2))]:
+        info = env.step(action)[-1]
+        exact.step(action)
+        command = env.unwrapped.command
+        np.testing.assert_allclose(command, exact.unwrapped.command, atol=1e-12)
+        wanted = 0.9 * command + [0.0, 0.001]
+        there = np.where(
+            there > wanted + 0.001, wanted + 0.001, np.where(there < wanted - 0.001, wanted - 0.001, there)
+        )
+        np.testing.assert_allclose(env.unwrapped.backend.state.command, there, atol=1e-12)
+        commands.append(command)
+        infos.append(info)
+    assert np.ptp(commands, axis=0).min() > 0.003  # far enough to leave the play on both sides
+    np.testing.assert_array_equal(infos[-1]["plant_offset"], [0.0, 0.001])
+    assert infos[-1]["plant_gain"] == 0.9
+
+
+def test_cables_that_stretch():
+    """The body lacks compliance times tension; a copy and an earlier moment have the same cables."""
+    env = gymnasium.make(FINGER, backend="fem", plant={"cable_compliance": {"cable_1": 4e-4}})
+    goal = {"options": {"goal": np.array([0.0, 0.04, -0.1])}}
+    play(env, np.ones((3, 2)), **goal)
+    state, command = env.unwrapped.backend.state, env.unwrapped.command
+    np.testing.assert_allclose(state.displacement + [4e-4, 0.0] * state.effort, command, atol=1e-9)
+    moment = env.unwrapped.get_state()
+    after = env.step(np.ones(2))[-1]
+    env.unwrapped.set_state(moment)
+    np.testing.assert_allclose(env.step(np.ones(2))[-1]["effector"], after["effector"], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "plant, message",
+    [
+        ({"offset": {"left": 0.001}}, "plant offset: .*left"),
+        ({"gain": {"cable_1": 0.0}}, "plant gain = 0.0; allowed: one or two numbers from 0.1 to 10.0"),
+        ({"cable_compliance": 1e-4}, "plant cable_compliance needs backend 'fem'"),
+    ],
+)
+def test_wrong_drives(plant, message):
+    with pytest.raises(ValueError, match=message):
+        gymnasium.make(FINGER, plant=plant, backend="surrogate")
+
+
+def test_drives_of_many_environments_are_drawn_in_each():
+    envs = gymnasium.make_vec(FINGER, num_envs=2, plant={"gain": [0.8, 1.2]})
+    _, info = envs.reset(seed=0)
+    assert info["plant_gain"].std() > 0.0
+    envs.close()
+
+
 def test_a_copy_goes_on_with_the_same_plant(actions):
     env = gymnasium.make(FINGER, plant={"delay": (1, 3), "noise": 0.01, "stiffness": (0.8, 1.2)})
     play(env, actions[:3])
