@@ -23,9 +23,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softgym_envs.agents.config import EnvironmentConfig, TrainConfig
-from softgym_envs.config import check_config, difference, load_config, provenance, shipped_configs
+from softgym_envs.config import check_config, difference, load_config, shipped_configs
 from softgym_envs.errors import ConfigError, DataError, SoftGymError
 from softgym_envs.executors import parallel_map
+from softgym_envs.runs import provenance
 from softgym_envs.storage import read_json, write_json
 
 if TYPE_CHECKING:

@@ -16,16 +16,9 @@ from softgym_envs.agents.evaluation import Evaluation, evaluate, evaluation_set
 from softgym_envs.agents.learners import make_learner
 from softgym_envs.agents.learners.base import Learner, Tensors
 from softgym_envs.agents.policy import Policy, read_tensors, save_policy
-from softgym_envs.config import (
-    continue_with_code,
-    difference,
-    load_stored,
-    provenance,
-    save_config,
-    save_resolved,
-)
 from softgym_envs.errors import DataError, WeightsError
 from softgym_envs.extras import require
+from softgym_envs.runs import RunFolder, provenance
 from softgym_envs.storage import atomic_write, read_json, write_json
 from softgym_envs.wording import counted
 
@@ -100,8 +93,9 @@ def train(
 
     Raises:
         ValueError: if the environment cannot be made; a new folder is then not created.
-        ConfigError: if ``initial`` was trained for another environment, or the folder's configuration cannot be read.
-        DataError: if the folder holds the training of another configuration, or one that cannot end at these steps.
+        ConfigError: if ``initial`` was trained for another environment, the folder's configuration cannot be read or is
+            another one, or another process trains there.
+        DataError: if the folder holds a training that cannot end at these steps.
         WeightsError: if ``initial`` or a checkpoint is damaged or does not fit the configuration.
     """
     require("train")
@@ -112,24 +106,27 @@ def train(
     if initial is not None:
         config = config.model_copy(update={"initial": str(initial)})
     folder = Path(folder)
-    earlier = _earlier_steps(config, folder)
+    place = RunFolder(folder, TrainConfig, "a training")
+    earlier = _earlier_steps(config, place)
     if earlier is not None and is_finished(folder, config.steps):
         return folder / POLICY
     run = _Run(config, folder, proposer)
-    # Files are written after all checks, so that invalid values neither leave a folder behind nor change one.
-    if earlier is None:
-        save_resolved(folder, config)
-    elif earlier != config.steps:
-        _save_extension(folder, config, earlier, run.learner.step)
-    change = continue_with_code(folder) if earlier is not None and run.learner.step else ""
-    if change and progress:
-        tqdm.write(f"warning: training '{folder}' was {change}; what they compute may differ")
-    run.learner.log_to(folder)
 
     def stop() -> bool:
         return run.outcome is not None and report is not None and bool(report(run.learner.step, run.outcome))
 
-    with tqdm(total=config.steps, initial=run.learner.step, unit="step", desc=folder.name, disable=not progress) as bar:
+    # Files are written after all checks, so that invalid values neither leave a folder behind nor change one.
+    with (
+        place.alone(),
+        tqdm(total=config.steps, initial=run.learner.step, unit="step", desc=folder.name, disable=not progress) as bar,
+    ):
+        if earlier is None:
+            place.begin(config)
+        elif earlier != config.steps:
+            _save_extension(place, config, earlier, run.learner.step)
+        if earlier is not None and run.learner.step and (change := place.continued()) and progress:
+            tqdm.write(f"warning: {change}")
+        run.learner.log_to(folder)
         stopped = stop()
         while run.learner.step < config.steps and not stopped:
             run.learn(bar.update)
@@ -150,22 +147,17 @@ def _finished_steps(folder: str | Path) -> int:
     return read_json(card)["config"]["steps"] if card.exists() else 0
 
 
-def _earlier_steps(config: TrainConfig, folder: Path) -> int | None:
+def _earlier_steps(config: TrainConfig, place: RunFolder[TrainConfig]) -> int | None:
     """Return the steps of the training that a folder holds, finished or not; None if it holds none.
 
     Raises:
-        ConfigError: if the folder's configuration cannot be read.
-        DataError: if it is that of another training, or of a finished one that cannot go on to the steps of ``config``.
+        ConfigError: if the folder's configuration cannot be read, or is that of another training.
+        DataError: if it is that of a finished training that cannot go on to the steps of ``config``.
     """
-    if not (folder / "config.yaml").exists():
+    if not place.begun:
         return None
-    stored = load_stored(folder, TrainConfig, "a training")
-    other = difference(stored, config, ignore=["steps"])
-    if other is not None:
-        raise DataError(
-            f"'{folder}' holds a training with another configuration: {other}; choose a new folder, or change only: "
-            "steps (to train on)"
-        )
+    place.accept(config, ["steps"])
+    stored, folder = place.config, place.path
     finished = _finished_steps(folder)
     if config.steps < finished:
         raise DataError(
@@ -188,13 +180,13 @@ def _earlier_steps(config: TrainConfig, folder: Path) -> int | None:
     return stored.steps
 
 
-def _save_extension(folder: Path, config: TrainConfig, earlier: int, step: int) -> None:
+def _save_extension(place: RunFolder[TrainConfig], config: TrainConfig, earlier: int, step: int) -> None:
     """Record that a training planned for ``earlier`` steps, which has made ``step``, ends at other ones."""
-    path = folder / "provenance.json"
+    path = place.path / "provenance.json"
     origin = read_json(path)
     extension = {"from_steps": earlier, "to_steps": config.steps, "at_step": step, "provenance": provenance()}
     write_json(path, {**origin, "extensions": [*origin.get("extensions", []), extension]})
-    save_config(folder, config)
+    place.keep(config)
 
 
 class _Run:

@@ -14,8 +14,8 @@ from typing import Any
 import click
 
 from benchmarks import beams, gpu, speed
-from softgym_envs.config import provenance
 from softgym_envs.errors import ConfigError, unknown_name
+from softgym_envs.runs import provenance
 from softgym_envs.storage import write_json
 
 ROOT = Path(__file__).resolve().parent.parent

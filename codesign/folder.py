@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -12,13 +12,11 @@ from softgym_envs.codesign.config import JOURNAL, StudyConfig
 from softgym_envs.codesign.goals import draw_goals
 from softgym_envs.codesign.records import Account, TrialResult
 from softgym_envs.codesign.scheduling.connect import open_storage
-from softgym_envs.codesign.scheduling.storage import SharedStorage, StudyStorage, file_lock
-from softgym_envs.config import check_compatible, check_config, load_stored, save_config, save_resolved
+from softgym_envs.codesign.scheduling.storage import SharedStorage, StudyStorage
+from softgym_envs.config import check_config
 from softgym_envs.errors import ConfigError, DataError
+from softgym_envs.runs import RunFolder, check_compatible
 from softgym_envs.storage import atomic_write, read_json, write_json
-
-if TYPE_CHECKING:
-    from filelock import BaseFileLock
 
 EXTENSIBLE = (
     *("name", "title", "trials", "workers", "executor", "heartbeat", "patience", "attempts"),
@@ -40,7 +38,7 @@ SHARED_POLICY_RECORD = "shared_policy/shared_policy.json"
 """File of its `softgym_envs.codesign.records.SharedPolicy`, relative to the folder of a study."""
 
 
-class StudyFolder:
+class StudyFolder(RunFolder[StudyConfig]):
     """The folder of a study.
 
     It contains::
@@ -63,7 +61,7 @@ class StudyFolder:
     """
 
     def __init__(self, path: str | Path) -> None:
-        self.path = Path(path).resolve()
+        super().__init__(Path(path).resolve(), StudyConfig, "a co-design study")
 
     @classmethod
     def create(cls, path: str | Path, config: StudyConfig, *, wait: bool = False) -> StudyFolder:
@@ -75,17 +73,16 @@ class StudyFolder:
         folder = cls(path)
         folder.path.mkdir(parents=True, exist_ok=True)
         with folder.lock("study"):
-            new = not (folder.path / "config.yaml").exists()
+            new = not folder.begun
             if new and (folder.path / "journal.log").exists():
                 raise ConfigError(f"folder '{path}' holds a journal but no config.yaml; use another folder")
             if not new:
                 _accept(folder.config, config, f"folder '{path}'", "folder", folder._tested_with())
             goals = None if config.storage == JOURNAL else folder._agree(config, str(path), wait)
             if new:
-                save_resolved(folder.path, config)
+                folder.begin(config)
             elif folder.config != config:
-                save_config(folder.path, config)  # provenance.json keeps the commit that began the study
-                folder.__dict__.pop("config", None)
+                folder.keep(config)
             if not (folder.path / "goals.json").exists():
                 write_json(folder.path / "goals.json", draw_goals(config) if goals is None else goals)
         return folder
@@ -138,13 +135,6 @@ class StudyFolder:
         return open_storage(self.path, self.config)
 
     @cached_property
-    def config(self) -> StudyConfig:
-        """The resolved configuration."""
-        if not (self.path / "config.yaml").exists():
-            raise DataError(f"'{self.path}' is not the folder of a co-design study: it has no config.yaml")
-        return load_stored(self.path, StudyConfig, "a co-design study")
-
-    @cached_property
     def goals(self) -> dict[str, np.ndarray]:
         """Goals [m] by use: ``training`` (k, 3), ``selection`` (k, p, 3), ``unseen`` (k, p, 3)."""
         stored = read_json(self.path / "goals.json")
@@ -154,10 +144,6 @@ class StudyFolder:
         """Return the time spent so far."""
         path = self.path / "account.json"
         return Account.read(path) if path.exists() else Account()
-
-    def lock(self, name: str) -> BaseFileLock:
-        """Return a lock shared by all processes of the folder, a `file_lock`."""
-        return file_lock(self.path, name)
 
     def policy(self, name: str) -> Path:
         """Return the file of a policy, from its path in the folder.

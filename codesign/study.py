@@ -31,7 +31,6 @@ from softgym_envs.codesign.scheduling.optuna_study import distributions, make_pr
 from softgym_envs.codesign.scheduling.processes import run_workers
 from softgym_envs.codesign.scheduling.queue import TrialQueue
 from softgym_envs.codesign.snapshot import load_study
-from softgym_envs.config import continue_with_code
 from softgym_envs.envs.options import design_names
 from softgym_envs.errors import ConfigError, ConvergenceError, InfeasibleDesign, SoftGymError
 from softgym_envs.extras import require
@@ -172,9 +171,9 @@ def _run_workers(
 ) -> str | None:
     """Return what `run_workers` does; before, warn if other code began the study."""
     with study.lock("study"):
-        change = continue_with_code(study.path)
+        change = study.continued()
     if change:
-        output.warn(f"study '{study.path}' was {change}; what they compute may differ")
+        output.warn(change)
     return run_workers(study, phase, count, tick)
 
 

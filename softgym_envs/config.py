@@ -4,16 +4,10 @@ from __future__ import annotations
 
 import copy
 import functools
-import hashlib
-import os
-import platform
 import re
 import reprlib
-import subprocess
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -22,8 +16,6 @@ from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from pydantic_core import ErrorDetails
 
 from softgym_envs.errors import ConfigError, unknown_name
-from softgym_envs.storage import atomic_write, read_json, write_json
-from softgym_envs.version import __version__
 
 
 class Config(BaseModel):
@@ -195,23 +187,6 @@ def config_text(path: Path) -> str:
     return yaml.safe_dump(_entry(path.parent, _read_file(path.parent), path.name), sort_keys=False)
 
 
-def load_stored(folder: str | Path, model: type[ModelT], kind: str) -> ModelT:
-    """Return the configuration that `save_config` wrote to a folder.
-
-    Args:
-        folder: the folder.
-        model: class of the configuration.
-        kind: what the folder should hold, for the message: ``"a training"``.
-
-    Raises:
-        ConfigError: if the folder holds something else, or its configuration cannot be read.
-    """
-    try:
-        return load_config(Path(folder) / "config.yaml", model)
-    except ConfigError as error:
-        raise ConfigError(f"folder '{folder}' does not hold {kind}: {error}; use another folder") from None
-
-
 def _find_files(model: type[BaseModel], data: dict[str, Any], folder: Path) -> None:
     """Replace paths in plain data that are relative to a folder, and exist there, by absolute ones."""
     for name, field in model.model_fields.items():
@@ -305,144 +280,3 @@ def _difference(old: Any, new: Any, key: str, ignore: frozenset[str]) -> str | N
         parts = (_difference(old[name], new[name], f"{key}.{name}" if key else name, ignore) for name in old)
         return next((part for part in parts if part is not None), None)
     return None if old == new else f"{key} = {reprlib.repr(old)}, got {reprlib.repr(new)}"
-
-
-def check_compatible(
-    old: Config, new: Config, found: str, *, may_change: Sequence[str] = (), use: str = "folder"
-) -> None:
-    """Check that stored results can be continued with a new configuration.
-
-    Args:
-        old: the configuration of the results.
-        new: the requested configuration.
-        found: location and kind of the results, for the message: ``"folder 'x' holds a search"``.
-        may_change: dotted keys that may differ.
-        use: what to change to start afresh: ``"folder"`` or ``"name"``.
-
-    Raises:
-        ConfigError: one line naming the first key that differs, both values, and the keys that may differ.
-    """
-    other = difference(old, new, ignore=may_change)
-    if other is not None:
-        allowed = f", or change only: {', '.join(may_change)}" if may_change else ""
-        raise ConfigError(f"{found} with {other}; use another {use}{allowed}")
-
-
-def commit_of(root: Path) -> str | None:
-    """Return the git commit of a source tree, with ``-dirty`` if files are modified, or None if it is unknown.
-
-    In a clone, git provides the commit; a source archive (``git archive``, a downloaded tag) stores it in a file.
-    """
-    archived = root / ".git_archival.txt"
-    if (root / ".git").exists():
-        try:
-            done = subprocess.run(
-                ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12"],
-                capture_output=True,
-                text=True,
-                timeout=60,
-                check=False,
-            )
-        except (OSError, subprocess.TimeoutExpired):
-            return None
-        return done.stdout.strip() or None
-    if archived.exists():
-        node = archived.read_text().removeprefix("node:").strip()
-        return None if node.startswith("$") else node[:12]
-    return None
-
-
-_NOT_SOURCES = ("configs", "agents/results", "extensions/leaderboard/data")
-"""Folders of the package that results do not follow from: a run keeps its configuration, and the others are records."""
-
-
-@functools.cache
-def _source_hash() -> str:
-    """Return a hash of the package's code, weights and meshes; it is the same in a checkout and in an installation."""
-    root = Path(__file__).resolve().parent
-    files: dict[str, Path] = {}
-    for folder, inside, names in os.walk(root, followlinks=True):  # agents and codesign may be links
-        place = Path(folder).relative_to(root)
-        inside[:] = [name for name in inside if (place / name).as_posix() not in _NOT_SOURCES]
-        files |= {(place / name).as_posix(): Path(folder, name) for name in names}
-    digest = hashlib.sha256()
-    for name in sorted(files):
-        if name.endswith((".py", ".json", ".npz", ".safetensors")) and files[name].is_file():  # no broken links
-            digest.update(f"{name}\0".encode() + hashlib.sha256(files[name].read_bytes()).digest())
-    return digest.hexdigest()[:12]
-
-
-def provenance() -> dict[str, Any]:
-    """Return the origin of a result: versions, git commit, hash of the package's sources, time and machine."""
-    versions = {"softgym-envs": __version__, "python": platform.python_version()}
-    for package in ("numpy", "scipy", "torch", "gymnasium", "stable-baselines3", "optuna", "gmsh", "proxsuite"):
-        try:
-            versions[package] = version(package)
-        except PackageNotFoundError:
-            continue
-    commit = commit_of(Path(__file__).resolve().parent.parent)
-    return {
-        "commit": commit,
-        "sources": _source_hash(),
-        "time": datetime.now(UTC).isoformat(timespec="seconds"),
-        "platform": platform.platform(),
-        "versions": versions,
-    }
-
-
-def code_change(begun: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    """Return how the code differs between two of `provenance`: ``"begun with A; continued with B"``, or ``""``.
-
-    A commit, hash of the sources or version that one of them does not know is no difference. Commits whose sources are
-    equal differ in tests or documentation only, and are no difference either.
-    """
-    before, after = (
-        {**{key: made.get(key) for key in ("commit", "sources")}, **made.get("versions", {})} for made in (begun, now)
-    )
-    changed = [name for name in before if None not in (before[name], after.get(name)) and before[name] != after[name]]
-    if "commit" in changed and "sources" in changed:
-        changed.remove("sources")
-    elif "commit" in changed and before["sources"] and after["sources"]:
-        changed.remove("commit")
-    if not changed:
-        return ""
-    old, new = (", ".join(f"{name} {made[name]}" for name in changed) for made in (before, after))
-    return f"begun with {old}; continued with {new}"
-
-
-def continue_with_code(folder: str | Path) -> str:
-    """Record in the provenance of a results folder that other code than began it continues it.
-
-    Call it before the first work that the folder does not have yet.
-
-    Returns:
-        The `code_change`, for a warning.
-    """
-    path = Path(folder) / "provenance.json"
-    if not path.exists():
-        return ""
-    begun, now = read_json(path), provenance()
-    change = code_change(begun, now)
-    continued = begun.get("continued", [])
-    if change and all(code_change(begun, other) != change for other in continued):
-        write_json(path, {**begun, "continued": [*continued, now]})
-    return change
-
-
-def code_changes(folder: str | Path) -> list[str]:
-    """Return each `code_change` that `continue_with_code` recorded in a results folder."""
-    path = Path(folder) / "provenance.json"
-    begun = read_json(path) if path.exists() else {}
-    return [code_change(begun, now) for now in begun.get("continued", [])]
-
-
-def save_resolved(folder: str | Path, config: Config) -> None:
-    """Write a configuration and its provenance to a results folder."""
-    save_config(folder, config)
-    write_json(Path(folder) / "provenance.json", provenance())
-
-
-def save_config(folder: str | Path, config: Config) -> None:
-    """Write a configuration to a results folder."""
-    with atomic_write(Path(folder) / "config.yaml", "w") as stream:
-        yaml.safe_dump(config.model_dump(mode="json"), stream, sort_keys=False)

@@ -7,19 +7,11 @@ from typing import Any
 
 import pytest
 
-from softgym_envs import config
+from softgym_envs import runs
 from softgym_envs.agents import EnvironmentConfig, TrainConfig
-from softgym_envs.config import (
-    Config,
-    check_compatible,
-    check_config,
-    code_change,
-    commit_of,
-    continue_with_code,
-    difference,
-    provenance,
-)
+from softgym_envs.config import Config, check_config, difference
 from softgym_envs.errors import ConfigError, DataError
+from softgym_envs.runs import check_compatible, code_change, commit_of, continue_with_code, provenance
 from softgym_envs.storage import JsonLines, drop_torn_line, read_json, write_json
 from softgym_envs.version import __version__
 
@@ -168,11 +160,11 @@ def test_the_hash_of_the_sources_follows_code_and_weights_alone(tmp_path, monkey
     (root / "configs").mkdir(parents=True)
     (linked / "results").mkdir(parents=True)
     (root / "agents").symlink_to(linked)
-    monkeypatch.setattr(config, "__file__", str(root / "config.py"))
+    monkeypatch.setattr(runs, "__file__", str(root / "runs.py"))
 
     def hashed(path, text):
         path.write_text(text)
-        return config._source_hash.__wrapped__()
+        return runs._source_hash.__wrapped__()
 
     first = hashed(root / "config.py", "a = 1")
     for other in (root / "configs" / "x.json", linked / "results" / "y.json", linked / "notes.md"):

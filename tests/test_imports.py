@@ -20,6 +20,7 @@ LAYERS = [
     {"softgym_envs.extras", "softgym_envs.storage", "softgym_envs.units"},
     {"softgym_envs._lazy"},
     {"softgym_envs.designs", "softgym_envs.config", "softgym_envs.registry", "softgym_envs.executors"},
+    {"softgym_envs.runs"},
     {"softgym_envs.mechanics"},
     {"softgym_envs.robots"},
     {"softgym_envs.surrogate"},

@@ -20,8 +20,8 @@ from softgym_envs.codesign.phases.ends import check_policy, run_ends
 from softgym_envs.codesign.phases.trial import assess, measure, training_config
 from softgym_envs.codesign.records import REFINED, Finalist, FinalistTest, FinalistTraining, Job, PlannedTest
 from softgym_envs.codesign.snapshot import StudySnapshot
-from softgym_envs.config import load_stored
 from softgym_envs.errors import ConfigError, ConvergenceError, InfeasibleDesign
+from softgym_envs.runs import RunFolder
 from softgym_envs.storage import read_json
 
 
@@ -150,7 +150,8 @@ def _trained_policy(folder: StudyFolder, finalist: Finalist, seed: int) -> Path:
     name = training_name(finalist.trial, seed)
     place = folder.path / "finalists" / name
     with folder.lock(f"training-{name}"):
-        if (place / "config.yaml").exists() and load_stored(place, TrainConfig, "a training").steps != steps:
+        earlier = RunFolder(place, TrainConfig, "a training")
+        if earlier.begun and earlier.config.steps != steps:
             shutil.rmtree(place)  # it has not ended, else the steps could not have changed; all bodies train alike
         policy = train(training, place, initial=initial, progress=False)
         if not (place / "training.json").exists():

@@ -30,7 +30,6 @@ from softgym_envs.codesign.report.statistics import (
     rate_interval,
 )
 from softgym_envs.codesign.snapshot import StudySnapshot
-from softgym_envs.config import code_changes, provenance
 from softgym_envs.wording import counted
 
 FEW_GOALS = 10
@@ -72,7 +71,7 @@ def collect(snapshot: StudySnapshot) -> StudyResults:
         importance=_importance(snapshot),
         cost=_cost(snapshot),
         success_distance=config.success_distance,
-        provenance={**provenance(), "code_changes": code_changes(snapshot.folder.path)},
+        provenance=snapshot.folder.stamp(),
     )
 
 

@@ -8,8 +8,9 @@ from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from softgym_envs.codesign.scheduling.storage import StudyStorage, file_lock
+from softgym_envs.codesign.scheduling.storage import StudyStorage
 from softgym_envs.errors import DataError
+from softgym_envs.runs import file_lock
 from softgym_envs.storage import drop_torn_line
 
 if TYPE_CHECKING:

@@ -9,22 +9,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
     import optuna
-    from filelock import BaseFileLock
 
 T = TypeVar("T")
-
-
-def file_lock(folder: Path, name: str) -> BaseFileLock:
-    """Return a lock shared by all processes of a study. The operating system frees it when its holder dies."""
-    from filelock import FileLock
-
-    (folder / "locks").mkdir(parents=True, exist_ok=True)
-    return FileLock(folder / "locks" / f"{name}.lock", poll_interval=0.01)
 
 
 class StudyStorage(ABC):

@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.codesign.tools.config import CalibrationConfig
-from softgym_envs.codesign.tools.folder import run_folder
 from softgym_envs.codesign.tools.measurements import Measurements, read_measurements
 from softgym_envs.codesign.tools.misfit import FEMMisfit, LearnedMisfit, Misfit
 from softgym_envs.codesign.tools.parameters import Parameters
 from softgym_envs.codesign.tools.plots import draw_calibration
 from softgym_envs.codesign.tools.records import CalibrationResult, Fit
-from softgym_envs.config import provenance
 from softgym_envs.errors import ConfigError, ConvergenceError, InfeasibleDesign
+from softgym_envs.runs import RunFolder, provenance
 from softgym_envs.storage import write_json
 from softgym_envs.wording import counted
 
@@ -45,7 +44,7 @@ def calibrate(
         data = read_measurements(config.data, config.make_robot())
     if folder is None:
         return _calibrate(config, data)
-    with run_folder(folder, config, "a calibration") as place:
+    with RunFolder(folder, CalibrationConfig, "a calibration").reserve(config) as place:
         result = _calibrate(config, data)
         write_json(place / "result.json", {**provenance(), **result.to_json()})
         units = {name: variable.unit for name, variable in config.box().free.variables.items()}

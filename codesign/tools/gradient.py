@@ -13,10 +13,9 @@ from torch import Tensor
 
 from softgym_envs.codesign.tools.box import Box
 from softgym_envs.codesign.tools.config import GradientConfig, ObjectiveConfig, OptimiseConfig
-from softgym_envs.codesign.tools.folder import run_folder
 from softgym_envs.codesign.tools.plots import draw_descents
 from softgym_envs.codesign.tools.records import BestDesign, Descent, GradientResult
-from softgym_envs.config import provenance
+from softgym_envs.runs import RunFolder, provenance
 from softgym_envs.storage import write_json
 
 
@@ -139,7 +138,7 @@ def optimise(config: OptimiseConfig, folder: str | Path | None = None) -> Gradie
     """
     if folder is None:
         return _optimise(config)[0]
-    with run_folder(folder, config, "an optimisation", may_change=("name", "workers")) as place:
+    with RunFolder(folder, OptimiseConfig, "an optimisation").reserve(config, ("name", "workers")) as place:
         result, cost = _optimise(config)
         write_json(place / "result.json", {**provenance(), **result.to_json()})
         ends = [cost.box.unit(descent.end) for descent in result.descents]

@@ -14,11 +14,10 @@ from softgym_envs.codesign.sampling import make_sampler
 from softgym_envs.codesign.scheduling.journal import open_journal
 from softgym_envs.codesign.tools.config import OptimiseConfig, SearchConfig
 from softgym_envs.codesign.tools.evaluation import Evaluation, evaluate_each
-from softgym_envs.codesign.tools.folder import run_folder
 from softgym_envs.codesign.tools.plots import draw_front
 from softgym_envs.codesign.tools.records import FrontDesign, SearchResult
-from softgym_envs.config import code_changes, provenance
 from softgym_envs.errors import ConvergenceError
+from softgym_envs.runs import RunFolder
 from softgym_envs.storage import atomic_write, write_json
 from softgym_envs.wording import counted
 
@@ -43,11 +42,12 @@ def search(config: OptimiseConfig, folder: str | Path, *, progress: bool = True)
         ConvergenceError: if no design is feasible.
     """
     may_change = ("name", "workers", "solver.trials")
-    with run_folder(folder, config, "a search", may_change=may_change, progress=progress) as place:
+    run = RunFolder(folder, OptimiseConfig, "a search")
+    with run.reserve(config, may_change, progress=progress) as place:
         study = _Search(config, place)
         study.run(progress)
         result, values, front = study.result()
-        write_json(place / "result.json", {**provenance(), "code_changes": code_changes(place), **result.to_json()})
+        write_json(place / "result.json", {**run.stamp(), **result.to_json()})
         study.write_table(place / "trials.csv")
         draw_front(place / "front.png", [o.find() for o in config.objectives], values, front)
     return result

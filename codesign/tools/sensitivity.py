@@ -16,11 +16,10 @@ from softgym_envs.codesign.tools.bodies import Evaluator
 from softgym_envs.codesign.tools.box import Box
 from softgym_envs.codesign.tools.config import SensitivityConfig
 from softgym_envs.codesign.tools.evaluation import Evaluation, evaluate_each
-from softgym_envs.codesign.tools.folder import run_folder
 from softgym_envs.codesign.tools.plots import draw_sensitivity
 from softgym_envs.codesign.tools.records import SensitivityResult
-from softgym_envs.config import code_changes, provenance
 from softgym_envs.errors import ConfigError, ConvergenceError, DataError
+from softgym_envs.runs import RunFolder
 from softgym_envs.storage import JsonLines, write_json
 
 Table = dict[str, dict[str, float]]
@@ -179,9 +178,10 @@ def analyse_sensitivity(config: SensitivityConfig, folder: str | Path, *, progre
         ConvergenceError: if too few designs are feasible.
     """
     may_change = ("name", "workers")
-    with run_folder(folder, config, "a sensitivity study", may_change=may_change, progress=progress) as place:
+    run = RunFolder(folder, SensitivityConfig, "a sensitivity study")
+    with run.reserve(config, may_change, progress=progress) as place:
         result = _analyse(config, place, progress)
-        write_json(place / "result.json", {**provenance(), "code_changes": code_changes(place), **result.to_json()})
+        write_json(place / "result.json", {**run.stamp(), **result.to_json()})
         metrics = [find_metric(name) for name in config.metrics]
         draw_sensitivity(place / "sensitivity.png", config.method, metrics, result.indices)
     return result

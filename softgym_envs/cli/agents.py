@@ -85,7 +85,8 @@ def evaluate(
     from softgym_envs.agents.evaluation import check_agent, evaluation_set, sample_goals
     from softgym_envs.agents.evaluation import evaluate as run
     from softgym_envs.agents.policy import Policy
-    from softgym_envs.config import load_config, provenance
+    from softgym_envs.config import load_config
+    from softgym_envs.runs import provenance
     from softgym_envs.storage import write_json
 
     environment = load_config(config, TrainConfig, overrides).environment

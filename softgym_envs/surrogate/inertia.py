@@ -18,10 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from softgym_envs.config import provenance
 from softgym_envs.errors import WeightsError
 from softgym_envs.mechanics.solvers.reduction import root
 from softgym_envs.robots.base import Robot
+from softgym_envs.runs import provenance
 from softgym_envs.storage import atomic_write
 from softgym_envs.surrogate.features import Features
 from softgym_envs.surrogate.weight_files import card_of, check_box

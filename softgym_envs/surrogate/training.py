@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from softgym_envs.config import BesideConfig, Config, save_resolved
+from softgym_envs.config import BesideConfig, Config
 from softgym_envs.extras import require
 from softgym_envs.robots.base import Robot
 from softgym_envs.robots.registry import make_robot
+from softgym_envs.runs import RunFolder
 from softgym_envs.storage import atomic_write
 from softgym_envs.surrogate.correction import fit_correction
 from softgym_envs.surrogate.data.dataset import generate_dataset
@@ -306,8 +307,9 @@ def generate_datasets(config: FitConfig, data_folder: str | Path, *, progress: b
         ``pretraining/train`` and ``pretraining/validation``; with a correction also ``correction/coarser``,
         ``correction/own`` and ``correction/finer``.
     """
-    if not (Path(data_folder) / "config.yaml").exists():  # an existing file is kept until the data are accepted
-        save_resolved(data_folder, config)
+    run = RunFolder(data_folder, FitConfig, "datasets")
+    if not run.begun:  # an existing file is kept until the data are accepted
+        run.begin(config)
     options, data = config.robot_options, config.data
     plans = {split: (options, data.plan(split)) for split in SPLITS}
     if data.more is not None:
@@ -332,7 +334,7 @@ def generate_datasets(config: FitConfig, data_folder: str | Path, *, progress: b
         )
         for name, (robot_options, plan) in plans.items()
     }
-    save_resolved(data_folder, config)
+    run.begin(config)
     return found
 
 
@@ -388,7 +390,7 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
     history = {f"{p}_{k}": np.array([row[k] for row in rows]) for p, rows in trained.histories.items() for k in rows[0]}
     with atomic_write(folder / "history.npz") as stream:
         np.savez_compressed(stream, allow_pickle=False, **history)
-    save_resolved(folder, config)
+    RunFolder(folder, FitConfig, "a fit").begin(config)
     load_model(folder, robot)  # fail now if the written files cannot be read
     if config.trust is not None:
         from softgym_envs.surrogate.calibration import calibrate

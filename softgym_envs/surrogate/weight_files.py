@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from softgym_envs.config import provenance
 from softgym_envs.errors import WeightsError
 from softgym_envs.robots.base import Robot
+from softgym_envs.runs import provenance
 from softgym_envs.storage import atomic_write, write_json
 from softgym_envs.surrogate.model import SurrogateModel
 from softgym_envs.surrogate.networks import network_module

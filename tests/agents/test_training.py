@@ -149,7 +149,9 @@ def test_damaged_checkpoint_is_named(tmp_path):
 
 def test_a_folder_of_another_configuration_is_refused(trained):
     shown = CONFIG.environment.model_copy(update={"robot_options": {"cables": 1}})
-    with pytest.raises(DataError, match=r"environment\.robot_options = \{\}, got \{'cables': 1\}.*change only: steps"):
+    with pytest.raises(
+        ConfigError, match=r"environment\.robot_options = \{\}, got \{'cables': 1\}.*change only: steps"
+    ):
         train(CONFIG.model_copy(update={"environment": shown}), trained.parent, progress=False)
 
 

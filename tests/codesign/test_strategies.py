@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from softgym_envs.agents.config import TrainConfig
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.folder import SHARED_POLICY, StudyFolder
 from softgym_envs.codesign.phases.finalists import _trained_policy
@@ -24,7 +25,7 @@ from softgym_envs.codesign.report.statistics import kendall_tau
 from softgym_envs.codesign.scheduling.optuna_study import open_study
 from softgym_envs.codesign.snapshot import load_study
 from softgym_envs.codesign.study import run_study
-from softgym_envs.config import save_resolved
+from softgym_envs.runs import RunFolder
 
 SHOWN = {"id": "SoftGym/FingerReach-v0", "design_in_observation": ["length", "height", "joint_height"]}
 LIMIT = 3.5e-5  # m3; bodies of the test lie on both sides
@@ -191,7 +192,9 @@ def test_a_training_of_a_finalist_with_other_steps_begins_again(study, monkeypat
 
     monkeypatch.setattr("softgym_envs.codesign.phases.finalists.train", train)
     for steps in (240, 90_000):  # the second one was begun by mistake
-        save_resolved(place, training_config(folder, finalist.design, {}).model_copy(update={"steps": steps}))
+        RunFolder(place, TrainConfig, "a training").begin(
+            training_config(folder, finalist.design, {}).model_copy(update={"steps": steps})
+        )
         with pytest.raises(KeyboardInterrupt):
             _trained_policy(folder, finalist, 1)
     assert began == [(240, True), (240, False)]

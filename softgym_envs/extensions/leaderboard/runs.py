@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.codesign.records import Record
-from softgym_envs.config import provenance
 from softgym_envs.extensions.leaderboard.frozen import FrozenProblem, load_problem, problem_names
 from softgym_envs.extensions.leaderboard.problem import Judge, Score
 from softgym_envs.extensions.leaderboard.scoring import DATA, front
 from softgym_envs.extensions.leaderboard.search import Search, make_optimiser, solve
 from softgym_envs.extensions.leaderboard.table import Table, TableSearch
+from softgym_envs.runs import provenance
 from softgym_envs.storage import atomic_write, read_json, write_json
 
 

@@ -15,7 +15,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from softgym_envs.agents.policy import Policy, policy_path
 from softgym_envs.codesign.records import Record
-from softgym_envs.config import first_problem, provenance
+from softgym_envs.config import first_problem
 from softgym_envs.errors import (
     ConfigError,
     ConvergenceError,
@@ -36,6 +36,7 @@ from softgym_envs.extensions.leaderboard.scoring import (
     write_reference,
 )
 from softgym_envs.extensions.leaderboard.search import Search
+from softgym_envs.runs import provenance
 from softgym_envs.storage import atomic_write, read_json
 
 TOLERANCE = {"qp": 1e-3, "shared": 1e-3, "trained": 5e-2, "policy": 1e-3}

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from softgym_envs.agents.evaluation import evaluate
-from softgym_envs.config import provenance
 from softgym_envs.errors import DataError, unknown_name
 from softgym_envs.extensions.leaderboard.frozen import FrozenProblem, load_problem
 from softgym_envs.extensions.leaderboard.problem import Judge, Score
@@ -25,6 +24,7 @@ from softgym_envs.extensions.leaderboard.rest import LONGEST, outcome, settle, s
 from softgym_envs.extensions.leaderboard.scoring import DATA
 from softgym_envs.extensions.leaderboard.search import Search
 from softgym_envs.extras import require
+from softgym_envs.runs import provenance
 from softgym_envs.storage import atomic_write, read_npz
 from softgym_envs.surrogate.pretrained import ships_weights
 

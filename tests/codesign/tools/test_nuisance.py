@@ -19,8 +19,9 @@ from softgym_envs.codesign.tools.measurements import measure, write_measurements
 from softgym_envs.codesign.tools.misfit import LearnedMisfit
 from softgym_envs.codesign.tools.nuisance import ContactConfig, OffsetConfig
 from softgym_envs.codesign.tools.parameters import Parameters
-from softgym_envs.config import check_config, save_resolved
+from softgym_envs.config import check_config
 from softgym_envs.errors import ConfigError, DataError
+from softgym_envs.runs import RunFolder
 
 MODULUS, ZERO = 2.2e6, 0.8
 COMMANDS = [[0.002], [0.004], [0.006], [0.008], [0.010]]
@@ -152,7 +153,7 @@ def test_the_command_reads_data_beside_its_configuration(finger, tensions, tmp_p
     monkeypatch.chdir(elsewhere)
     write_measurements(folder / "tensions.csv", finger, tensions)
     config = configured("young_modulus", nuisances={"zero": OFFSET}, data="tensions.csv", level=None)
-    save_resolved(folder, config)
+    RunFolder(folder, CalibrationConfig, "a calibration").begin(config)
     done = CliRunner().invoke(calibrate_command, ["--config", str(folder / "config.yaml"), "--folder", "out"])
     assert done.exit_code == 0, done.output
     assert "young_modulus = 2.2" in done.output and "zero = 0." in done.output
