@@ -42,7 +42,15 @@ def test_training_leaves_policy_curve_logs_and_provenance(trained):
     folder = trained.parent
     assert trained.name == "policy.safetensors"
     names = {p.name for p in folder.iterdir()}
-    assert names == {"policy.safetensors", "policy.json", "curve.csv", "config.yaml", "provenance.json", "tensorboard"}
+    assert names == {
+        "policy.safetensors",
+        "policy.json",
+        "curve.csv",
+        "config.yaml",
+        "provenance.json",
+        "tensorboard",
+        "locks",
+    }
     with open(folder / "curve.csv") as stream:
         rows = list(csv.DictReader(stream))
     assert [int(r["step"]) for r in rows] == [200, 400]
