@@ -274,8 +274,8 @@ def test_a_continued_run_keeps_its_first_provenance(stub, tmp_path, capsys):
         analyse_sensitivity(study("oat", workers=workers), tmp_path / "sensitivity")
 
     for run, name, kind in (
-        (run_search, "search", "a search"),
-        (run_sensitivity, "sensitivity", "a sensitivity study"),
+        (run_search, "search", "search"),
+        (run_sensitivity, "sensitivity", "sensitivity study"),
     ):
         folder = tmp_path / name
         run(1)
