@@ -195,14 +195,14 @@ def _find_files(model: type[BaseModel], data: dict[str, Any], folder: Path) -> N
             continue
         if any(isinstance(mark, BesideConfig) for mark in field.metadata):
             if isinstance(value, dict):
-                data[name] = {key: _found_beside(folder, each) for key, each in value.items()}
+                data[name] = {key: _resolve_relative(folder, each) for key, each in value.items()}
             else:
-                data[name] = _found_beside(folder, value)
+                data[name] = _resolve_relative(folder, value)
         elif isinstance(value, dict) and isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
             _find_files(field.annotation, value, folder)
 
 
-def _found_beside(folder: Path, value: Any) -> Any:
+def _resolve_relative(folder: Path, value: Any) -> Any:
     """Return the absolute path of a file in a folder; any other value, such as a name, unchanged."""
     if not isinstance(value, str) or not ("/" in value or Path(value).suffix):
         return value

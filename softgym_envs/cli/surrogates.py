@@ -60,7 +60,11 @@ def fit(config: Path, folder: Path, data: Path | None, quiet: bool, overrides: t
 )
 @click.option("--states", type=click.IntRange(1), default=5, show_default=True, help="Number of commands per body.")
 @click.option(
-    "--attacks", type=click.IntRange(0), default=500, show_default=True, help="Number of states of each search."
+    "--adversarial-states",
+    type=click.IntRange(0),
+    default=500,
+    show_default=True,
+    help="Number of states of each search for the worst trusted ones.",
 )
 @click.option("--seed", type=click.IntRange(0), default=11, show_default=True, help="Seed of all states.")
 @click.option("--kept-only", is_flag=True, help="Calibrate on what FOLDER holds of an interrupted run.")
@@ -72,7 +76,7 @@ def calibrate_trust(
     folder: Path | None,
     bodies: int,
     states: int,
-    attacks: int,
+    adversarial_states: int,
     seed: int,
     kept_only: bool,
     workers: int,
@@ -91,8 +95,8 @@ def calibrate_trust(
     body = options.robot_of(robot, options_)
     with nullcontext() if folder is None else options.resumable():
         found = calibrate(
-            weights or pretrained_folder(body), body, bodies=bodies, states=states, attacks=attacks, seed=seed,
-            state_folder=folder, kept_only=kept_only, workers=workers,
+            weights or pretrained_folder(body), body, bodies=bodies, states=states,
+            adversarial_states=adversarial_states, seed=seed, state_folder=folder, kept_only=kept_only, workers=workers,
         )  # fmt: skip
     click.echo(json.dumps({name: asdict(row) for name, row in found.items()}, indent=2))
 

@@ -335,7 +335,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         command = self.plant.drive(command, self.backend.state.command)
         converged = True
         if self.task.touches:
-            self.backend.touch(self.plant.touch_on_model(self.task.touch(self._step)))
+            self.backend.touch(self.plant.equivalent_model_force(self.task.touch(self._step)))
         push = self.task.push(self._step)
         try:
             self.backend.step(command, force=None if push is None else push / self.plant.stiffness)

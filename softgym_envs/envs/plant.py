@@ -20,7 +20,7 @@ class Plant:
 
     Attributes:
         stiffness: factor of the elastic stiffness of the whole body. It multiplies all efforts and divides ``W``; a
-            given force deforms the body as a smaller one deforms the model, see `touch_on_model`.
+            given force deforms the body as a smaller one deforms the model, see `equivalent_model_force`.
         cable_friction: coefficient of friction of cables on their guides, by the capstan law; finite elements only.
         delay: control steps between sending a command and its arrival at the drives.
         noise: standard deviation of all sensors: of displacements over their range, of efforts and of sensor rows over
@@ -51,7 +51,7 @@ class Plant:
             return command
         return play(self.gain * command + self.offset, last, np.asarray(self.backlash))
 
-    def touch_on_model(self, load: PointForce | None) -> PointForce | None:
+    def equivalent_model_force(self, load: PointForce | None) -> PointForce | None:
         """Return the force that deforms the model as a force on the plant deforms the plant.
 
         Both have the same shape if all forces on the stiffer body are larger by the same factor.

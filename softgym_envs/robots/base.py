@@ -37,7 +37,7 @@ MAX_LENGTH = 10.0
 PUBLISHED = "published"
 """Name of the design box that every robot has: the bounds with which its class defines its design space."""
 
-WITHOUT_CONTACT: dict[str, object] = {
+CONTACT_DEFAULTS: dict[str, object] = {
     "obstacles": (),
     "self_contact": False,
     "self_friction": 0.0,
@@ -46,7 +46,7 @@ WITHOUT_CONTACT: dict[str, object] = {
 }
 """Options of a robot that touches nothing. They are not part of its key."""
 
-OMITTED: dict[str, object] = WITHOUT_CONTACT | UNIFORM | {"sealed": False, "touch": False}
+DEFAULTS_NOT_IN_KEY: dict[str, object] = CONTACT_DEFAULTS | UNIFORM | {"sealed": False, "touch": False}
 """Values of options that are not part of a robot's key."""
 
 TOUCH_RADIUS = 2.5e-3
@@ -329,14 +329,15 @@ class Robot(ABC):
 
         The options are the arguments of the constructor, defaults included. If the robot has an attribute of the
         same name, for example because a default depends on other options, the attribute's value is used. Options of
-        contact, of meshes and of single robots are left out at their simplest values (`OMITTED`).
+        contact, of meshes and of single robots are left out at their simplest values (`DEFAULTS_NOT_IN_KEY`).
         """
         values = {name: vars(self).get(name, value) for name, value in self._options.items()}
         values |= {name: vars(self)[name] for name in FOLLOWING if vars(self).get(name)}
         return {
             name: _json_value(value, f"option '{name}' of robot '{self.name}'")
             for name, value in values.items()
-            if name not in self.non_mechanical_options and not (name in OMITTED and OMITTED[name] == value)
+            if name not in self.non_mechanical_options
+            and not (name in DEFAULTS_NOT_IN_KEY and DEFAULTS_NOT_IN_KEY[name] == value)
         }
 
     @property

@@ -30,7 +30,7 @@ from softgym_envs.errors import WeightsError
 from softgym_envs.robots.base import Robot
 from softgym_envs.storage import write_json
 from softgym_envs.surrogate.data.sampling import pushed
-from softgym_envs.surrogate.data.strata import Commands, JudgedStates, draw_commands, solve_commands, strata_of
+from softgym_envs.surrogate.data.strata import Commands, StratifiedStates, draw_commands, solve_commands, strata_of
 from softgym_envs.surrogate.domain import Calibration
 from softgym_envs.surrogate.features import learned_variables
 from softgym_envs.surrogate.model import SurrogateModel
@@ -68,7 +68,7 @@ other values."""
 
 ROUNDS = 4
 POOL = 8
-"""Bodies and commands from which an adversary chooses each of its own."""
+"""Candidate designs and commands of the adversarial search."""
 
 
 @dataclass(frozen=True)
@@ -125,31 +125,31 @@ def reached(model: SurrogateModel, context: Any, command: np.ndarray) -> tuple[n
     return displacement, found
 
 
-def predict(model: SurrogateModel, states: JudgedStates) -> Predictions:
+def predict(model: SurrogateModel, states: StratifiedStates) -> Predictions:
     """Return a model's predictions under the commands of judged states."""
     context = model.context(states.design)
     displacement, found = reached(model, context, states.command)
     effector, spread = model.effector(context, displacement)
     uncertainty, trusted = model.trust(context, displacement, spread, states.command)
     off = (effector - states.effector).reshape(len(states), -1, 3)
-    growth = model.growth(context, displacement) if model.domain.limits_growth else np.ones(len(states))
+    growth = model.softening_ratio(context, displacement) if model.domain.limits_growth else np.ones(len(states))
     error = np.linalg.norm(off, axis=2).max(axis=1)
     return Predictions(error, spread, uncertainty, trusted & found, growth, found & states.found)
 
 
-def report(model: SurrogateModel, states: JudgedStates) -> dict[str, StratumReport]:
+def report(model: SurrogateModel, states: StratifiedStates) -> dict[str, StratumReport]:
     """Return how a model does in each stratum of judged states, and in all that touch, under `TOUCHING`."""
     return _by_stratum(predict(model, states), states)
 
 
-def _by_stratum(every: Predictions, states: JudgedStates) -> dict[str, StratumReport]:
+def _by_stratum(every: Predictions, states: StratifiedStates) -> dict[str, StratumReport]:
     groups = {str(stratum): states.stratum == stratum for stratum in dict.fromkeys(states.stratum.tolist())}
     if states.touching.any():
         groups[TOUCHING] = states.touching
     return {name: _report(every, states, which) for name, which in groups.items() if (which & every.found).any()}
 
 
-def _report(every: Predictions, states: JudgedStates, which: np.ndarray) -> StratumReport:
+def _report(every: Predictions, states: StratifiedStates, which: np.ndarray) -> StratumReport:
     """Return how a model does in some of the judged states."""
     rows = which & every.found
     return StratumReport(
@@ -175,7 +175,7 @@ def judged_states(
     folder: str | Path | None = None,
     kept_only: bool = False,
     workers: int = 1,
-) -> JudgedStates:
+) -> StratifiedStates:
     """Return FEM states of all strata of a model's robot.
 
     Args:
@@ -191,13 +191,13 @@ def judged_states(
         _drawn(model, stratum, bodies, states, seed, folder, kept_only, workers)
         for stratum in strata_of(model.robot, buckles=model.domain.limits_growth)
     ]
-    return JudgedStates.join(parts)
+    return StratifiedStates.join(parts)
 
 
 def _drawn(
     model: SurrogateModel, stratum: str, bodies: int, states: int, seed: int,
     folder: str | Path | None, kept_only: bool, workers: int,
-) -> JudgedStates:  # fmt: skip
+) -> StratifiedStates:  # fmt: skip
     """Return FEM states of one stratum."""
     commands = draw_commands(model.robot, stratum, bodies, states, seed, softness(model), learned_bounds(model))
     return solve_commands(model.robot, commands, folder=folder, kept_only=kept_only, workers=workers)
@@ -215,7 +215,7 @@ def softness(model: SurrogateModel) -> Callable[[np.ndarray, np.ndarray], np.nda
     def growth(designs: np.ndarray, commands: np.ndarray) -> np.ndarray:
         context = model.context(designs)
         displacement, found = reached(model, context, commands)
-        return np.where(found, np.nan_to_num(model.growth(context, displacement), posinf=0.0), 0.0)
+        return np.where(found, np.nan_to_num(model.softening_ratio(context, displacement), posinf=0.0), 0.0)
 
     return growth
 
@@ -235,7 +235,7 @@ def conformal_quantile(scores: np.ndarray) -> float:
     return float(np.sort(scores)[rank - 1])
 
 
-def fit_calibration(model: SurrogateModel, states: JudgedStates) -> Calibration:
+def fit_calibration(model: SurrogateModel, states: StratifiedStates) -> Calibration:
     """Return the calibration of a model on judged states.
 
     Floor and power are those with the least pinball loss of the logarithmic errors, all strata being equally important.
@@ -283,7 +283,7 @@ def _calibrated(model: SurrogateModel, calibration: Calibration, limit: float = 
     return with_domain(model, inflation=1.0, limit=limit, calibration=entries)
 
 
-def usual_growth(model: SurrogateModel, states: JudgedStates) -> float | None:
+def usual_growth(model: SurrogateModel, states: StratifiedStates) -> float | None:
     """Return the largest growth to be trusted, or None if nearly all commands of judged states have an equilibrium.
 
     It is a bound on `USUAL` of the states inside that have one.
@@ -309,8 +309,8 @@ def safe_limit(judged: Predictions, tolerance: float) -> float:
 
 
 def calibrate(
-    folder: str | Path, robot: Robot, *, bodies: int = 64, states: int = 5, attacks: int = 500, seed: int = 11,
-    state_folder: str | Path | None = None, kept_only: bool = False, workers: int = 1,
+    folder: str | Path, robot: Robot, *, bodies: int = 64, states: int = 5, adversarial_states: int = 500,
+    seed: int = 11, state_folder: str | Path | None = None, kept_only: bool = False, workers: int = 1,
 ) -> dict[str, StratumReport]:  # fmt: skip
     """Calibrate the weights of a folder and write the result to their card.
 
@@ -319,7 +319,7 @@ def calibrate(
         robot: their robot.
         bodies: bodies of each stratum.
         states: commands of each body.
-        attacks: states of each search for the worst trusted ones; 0 for no search.
+        adversarial_states: states of each search for the worst trusted ones; 0 for no search.
         seed: of all random numbers.
         state_folder: where the FEM states are kept, so that an interrupted run continues.
         kept_only: calibrate on the states that the folder holds, without solving the rest; only those of the search
@@ -345,16 +345,16 @@ def calibrate(
     if not model.domain.limits_growth and (growth := usual_growth(model, known)) is not None:
         limits_growth, model = True, with_domain(model, growth=growth)
         softest = _drawn(model, "near buckling", bodies, states, seed, state_folder, kept_only, workers)
-        known = JudgedStates.join([known, softest])
+        known = StratifiedStates.join([known, softest])
     calibration = fit_calibration(model, known)
     unlimited, everything = _calibrated(model, calibration), known
     limits: list[float] = []  # below which searches were made
     limit = safe_limit(predict(unlimited, known), robot.goal_tolerance)
-    while attacks and len(limits) < SEARCHES and (not limits or limit < (1.0 - ROUNDING) * limits[-1]):
+    while adversarial_states and len(limits) < SEARCHES and (not limits or limit < (1.0 - ROUNDING) * limits[-1]):
         limits.append(limit)
         limited = _calibrated(model, calibration, limit)
-        found_states = attack(limited, attacks, states, seed, state_folder, len(limits), workers)
-        everything = JudgedStates.join([everything, found_states])
+        found_states = adversarial_search(limited, adversarial_states, states, seed, state_folder, len(limits), workers)
+        everything = StratifiedStates.join([everything, found_states])
         limit = safe_limit(predict(unlimited, everything), robot.goal_tolerance)
     model = _calibrated(model, calibration, limit)
     found = report(model, everything)
@@ -366,21 +366,22 @@ def calibrate(
     if model.domain.limits_growth:
         card["domain"]["growth"] = model.domain.growth
     card["calibration"] = {
-        "bodies": bodies, "states": states, "attacks": attacks, "seed": seed, "kept_only": kept_only, "limits": limits,
-        "limits_growth": limits_growth, "strata": {name: asdict(row) for name, row in found.items()},
+        "bodies": bodies, "states": states, "adversarial_states": adversarial_states, "seed": seed,
+        "kept_only": kept_only, "limits": limits, "limits_growth": limits_growth,
+        "strata": {name: asdict(row) for name, row in found.items()},
     }  # fmt: skip
     write_json(card_path, card)
     return found
 
 
-def cross_validated(model: SurrogateModel, states: JudgedStates, folds: int = 16) -> dict[str, StratumReport]:
+def cross_validated(model: SurrogateModel, states: StratifiedStates, folds: int = 16) -> dict[str, StratumReport]:
     """Return how a model does where its calibration has not seen the body, for states too expensive to solve others.
 
     Bodies are divided into parts. Factors and limit of trust for the states of each part are those of all other parts.
 
     Args:
         model: its own calibration is not used.
-        states: those of the calibration, with or without those of an attack.
+        states: those of the calibration, with or without those of an adversarial search.
         folds: number of parts.
     """
     tolerance, parts, order = model.robot.goal_tolerance, [], []
@@ -396,7 +397,7 @@ def cross_validated(model: SurrogateModel, states: JudgedStates, folds: int = 16
     return _by_stratum(every, states)
 
 
-def calibration_states(model: SurrogateModel, folder: str | Path) -> JudgedStates:
+def calibration_states(model: SurrogateModel, folder: str | Path) -> StratifiedStates:
     """Return the states by which a calibrated model was calibrated, those of the search included.
 
     Args:
@@ -406,24 +407,24 @@ def calibration_states(model: SurrogateModel, folder: str | Path) -> JudgedState
     made = model.card["calibration"]
     sizes = made["states"], made["seed"], folder
     known = judged_states(model, made["bodies"], *sizes, made.get("kept_only", False))
-    if not made["attacks"]:
+    if not made["adversarial_states"]:
         return known
     if "limits" not in made:  # calibrated before searches were repeated
         made = {**made, "limits": [model.robot.goal_tolerance], "first": 0}
     searched = [
-        attack(with_domain(model, limit=limit), made["attacks"], *sizes, number)
+        adversarial_search(with_domain(model, limit=limit), made["adversarial_states"], *sizes, number)
         for number, limit in enumerate(made["limits"], start=made.get("first", 1))
     ]
-    return JudgedStates.join([known, *searched])
+    return StratifiedStates.join([known, *searched])
 
 
 # -- the worst trusted states --------------------------------------------------------------------------------------
 
 
-def attack(
+def adversarial_search(
     model: SurrogateModel, count: int, states: int, seed: int,
     folder: str | Path | None = None, number: int = 0, workers: int = 1,
-) -> JudgedStates:  # fmt: skip
+) -> StratifiedStates:  # fmt: skip
     """Search for trusted states with large errors; return all that were judged, in the stratum ``adversarial``.
 
     In each of `ROUNDS` rounds, gradients of the spread move bodies and commands from anywhere in the box of trust to
@@ -442,7 +443,7 @@ def attack(
     rng = np.random.default_rng([seed, 99 + number])
     robot = model.robot
     d, n, bodies = len(learned_variables(robot)), len(robot.actuators), max(1, count // (ROUNDS * states))
-    parts: list[JudgedStates] = []
+    parts: list[StratifiedStates] = []
     origin: list[tuple[np.ndarray, np.ndarray]] = []
     scores: list[np.ndarray] = []
     for _ in range(ROUNDS):
@@ -471,10 +472,12 @@ def attack(
         error = np.where(judged.found & judged.trusted, judged.error, 0.0)
         origin.append((x, c))
         scores.append(_worst_of_bodies(designs, command, found, error))
-    return JudgedStates.join(parts)
+    return StratifiedStates.join(parts)
 
 
-def _worst_of_bodies(designs: np.ndarray, command: np.ndarray, found: JudgedStates, error: np.ndarray) -> np.ndarray:
+def _worst_of_bodies(
+    designs: np.ndarray, command: np.ndarray, found: StratifiedStates, error: np.ndarray
+) -> np.ndarray:
     """Return the largest error (B,) of each body's states; 0 for a body that could not be built.
 
     Several bodies may share a design, above all at vertices of the box, under different commands.

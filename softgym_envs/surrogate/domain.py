@@ -99,7 +99,7 @@ class Calibration:
 
 
 @njit(cache=True, error_model="numpy")
-def judge(
+def assess_trust(
     displacement, command, spread, slot, low, high, command_low, command_high, pulls,
     factor, corner, known, scale, floor, power, limit, uncertainty, doubt,
 ):  # fmt: skip

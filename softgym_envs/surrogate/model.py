@@ -19,7 +19,7 @@ from softgym_envs.mechanics.condensation import CondensedModel, Roles, Row, poin
 from softgym_envs.mechanics.solvers.complementarity import solve_rows
 from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.correction import EffortCorrection
-from softgym_envs.surrogate.domain import SOFT, Domain, judge
+from softgym_envs.surrogate.domain import SOFT, Domain, assess_trust
 from softgym_envs.surrogate.features import Features
 from softgym_envs.units import effort_unit
 
@@ -48,7 +48,7 @@ def definite(matrices):
 
 
 @njit(cache=True, error_model="numpy")
-def softer(factor, stiffness, unmoved, slot):
+def exceeds_softening(factor, stiffness, unmoved, slot):
     """Return which stiffnesses (B, n, n) are more than ``factor`` times softer than those of their bodies, shape (B,).
 
     Those of the bodies, ``unmoved`` (S, n, n), are at displacement zero; ``slot`` (B,) is the body of each row. A body
@@ -300,13 +300,13 @@ class SurrogateModel(ABC):
         scales, soft, arrays = np.array([scale]), None, context.arrays
         if domain.limits_growth:
             bodies, K = (arrays["unmoved"], context.slot), self._curvature(context, displacement)
-            soft = softer(domain.growth, K, *bodies)
+            soft = exceeds_softening(domain.growth, K, *bodies)
             # What is not softer than the smaller factor is not softer than the larger one either.
             if calibration.buckling != 1.0 and (soft.any() or calibration.soft < domain.growth):
-                near = softer(calibration.soft, K, *bodies)
+                near = exceeds_softening(calibration.soft, K, *bodies)
                 scales = np.where(near, scale * calibration.buckling, scale)
         uncertainty, doubt = np.empty(len(displacement)), np.empty(len(displacement), dtype=np.int8)
-        judge(
+        assess_trust(
             displacement, displacement if command is None else command, spread, context.slot, domain.low, domain.high,
             domain.command_low, domain.command_high, domain.unilateral, arrays["factor"], arrays["corner"],
             arrays["known"], scales, floor, power, domain.limit, uncertainty, doubt,
@@ -315,7 +315,7 @@ class SurrogateModel(ABC):
             doubt[soft] |= SOFT
         return uncertainty, doubt
 
-    def growth(self, context: Context, displacement: np.ndarray) -> np.ndarray:
+    def softening_ratio(self, context: Context, displacement: np.ndarray) -> np.ndarray:
         """Return how many times softer the actuators are at displacements (B, n_a) than at zero, shape (B,).
 
         This is the largest ratio, over all directions, of the two predicted compliances between actuators; near
@@ -357,7 +357,7 @@ class SurrogateModel(ABC):
         return np.linalg.inv(self._compliance(context, displacement)[:, : self.count, : self.count])
 
     def _curvature(self, context: Context, displacement: np.ndarray) -> np.ndarray:
-        """Return the stiffness that `growth` uses in every step; it may be a cheaper estimate."""
+        """Return the stiffness that `softening_ratio` uses in every step; it may be a cheaper estimate."""
         return self._stiffness(context, displacement)
 
     @abstractmethod

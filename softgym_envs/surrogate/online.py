@@ -353,7 +353,9 @@ def _widened(before: Model, after: Model, data: Mapping[str, np.ndarray], withhe
     for name, box in domain["design"].items():
         domain["design"][name] = _grown(box, data["design"][:, names.index(name)])
     if "growth" in domain:
-        learned, beyond = (after.growth(after.context(d["design"]), d["displacement"]) for d in (data, left_out))
+        learned, beyond = (
+            after.softening_ratio(after.context(d["design"]), d["displacement"]) for d in (data, left_out)
+        )
         bound = min(GROWTH, float(beyond.min(initial=np.inf)))
         domain["growth"] = max(domain["growth"], min(float(learned.max()), bound))
     if withheld.any():

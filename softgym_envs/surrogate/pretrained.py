@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from softgym_envs.errors import WeightsError
-from softgym_envs.robots.base import WITHOUT_CONTACT, Robot
+from softgym_envs.robots.base import CONTACT_DEFAULTS, Robot
 from softgym_envs.robots.registry import ROBOTS
 from softgym_envs.surrogate.model import SurrogateModel
 from softgym_envs.surrogate.weight_files import load_model
@@ -56,7 +56,7 @@ def _card(folder: Path) -> dict[str, Any]:
 
 def _contact_of(key: Mapping[str, Any]) -> dict[str, Any]:
     """Return the options of contact in a key; none for a robot that touches nothing, whatever its other options."""
-    found = {name: key[name] for name in WITHOUT_CONTACT if name in key}
+    found = {name: key[name] for name in CONTACT_DEFAULTS if name in key}
     return found if found.get("obstacles") or found.get("self_contact") else {}
 
 

@@ -161,13 +161,13 @@ class TrustConfig(Config):
     Attributes:
         bodies: bodies of each stratum.
         states: commands of each body.
-        attacks: states of the search for the worst trusted ones; 0 for no search.
+        adversarial_states: states of the search for the worst trusted ones; 0 for no search.
         seed: of all these states.
     """
 
     bodies: int = Field(default=64, gt=0)
     states: int = Field(default=5, gt=0)
-    attacks: int = Field(default=500, ge=0)
+    adversarial_states: int = Field(default=500, ge=0)
     seed: int = Field(default=11, ge=0)
 
 
@@ -295,7 +295,7 @@ def domain_of(
         limit = domain["inflation"] * float(np.quantile(spread, 0.98))
         domain["limit"] = min(limit, model.robot.goal_tolerance)
     if model.robot.convex and 1.0 - stable.mean() > BUCKLING:
-        domain["growth"] = float(np.quantile(model.growth(context, data["displacement"]), 0.98))
+        domain["growth"] = float(np.quantile(model.softening_ratio(context, data["displacement"]), 0.98))
     return domain
 
 

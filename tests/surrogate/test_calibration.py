@@ -17,7 +17,7 @@ from softgym_envs.surrogate import calibration as module
 from softgym_envs.surrogate.calibration import (
     FACTOR_OF,
     Predictions,
-    attack,
+    adversarial_search,
     calibrate,
     conformal_quantile,
     fit_calibration,
@@ -29,7 +29,7 @@ from softgym_envs.surrogate.calibration import (
     with_domain,
 )
 from softgym_envs.surrogate.data import strata
-from softgym_envs.surrogate.data.strata import JudgedStates, draw_commands, strata_of
+from softgym_envs.surrogate.data.strata import StratifiedStates, draw_commands, strata_of
 from softgym_envs.surrogate.domain import OUTSIDE, SOFT, SPREAD, Calibration, Domain, doubt_text
 from softgym_envs.surrogate.features import learned_variables
 from softgym_envs.surrogate.pretrained import pretrained_folder, pretrained_model, shipped_robots
@@ -65,7 +65,7 @@ def predicted_states(model, stratum, bodies, states, seed, noise=None):
     effector = effector.copy()
     effector[:, :3] += error[:, None] * direction
     rows = len(command)
-    return JudgedStates(
+    return StratifiedStates(
         stratum=np.full(rows, stratum, dtype="<U14"),
         body=np.repeat(np.arange(bodies), states),
         design=design,
@@ -221,7 +221,7 @@ def test_every_stratum_is_covered_on_new_states(robot, bodies, off):
                 return scale * spread * np.abs(rng.standard_normal(len(spread)))
 
             parts.append(predicted_states(model, stratum, bodies, 4, seed, noise))
-        return JudgedStates.join(parts)
+        return StratifiedStates.join(parts)
 
     found = fit_calibration(model, states(1))
     calibrated = module._calibrated(model, found)
@@ -236,7 +236,7 @@ def test_every_stratum_is_covered_on_new_states(robot, bodies, off):
 
 def test_bodies_that_are_left_out_are_judged_by_the_others(trunk):
     kinds = strata_of(trunk.robot, buckles=False)
-    states = JudgedStates.join(
+    states = StratifiedStates.join(
         [
             predicted_states(trunk, kind, 10, 2, seed=k, noise=lambda spread, rng: spread * rng.uniform(0.9, 1.0))
             for k, kind in enumerate(kinds)
@@ -271,7 +271,7 @@ def test_the_limit_is_below_all_wrong_states():
 
 def test_commands_without_an_equilibrium_are_told_by_their_softness(trunk, monkeypatch):
     """Growth is that of a made-up model; FEM finds no equilibrium where it is large."""
-    states = JudgedStates.join([predicted_states(trunk, kind, 50, 2, 3) for kind in ("inside", "faces")])
+    states = StratifiedStates.join([predicted_states(trunk, kind, 50, 2, 3) for kind in ("inside", "faces")])
     growth = 1.0 + np.arange(len(states)) / len(states)
     monkeypatch.setattr(module, "softness", lambda model: lambda designs, commands: growth[: len(designs)])
     # All have an equilibrium, or nearly all: no limit.
@@ -308,13 +308,13 @@ def test_an_attack_finds_what_random_states_do_not(trunk, monkeypatch):
         away = ((design[:, columns] - low) / (high - low)).sum(axis=1)
         effector = effector + 5e-3 * np.exp(-20.0 * away)[:, None] * np.eye(3)[0]
         rows, found = len(design), np.ones(len(design), bool)
-        return JudgedStates(
+        return StratifiedStates(
             np.repeat(commands.stratum, states), np.repeat(np.arange(count), states), design, command, displacement,
             command, effector, ~found, ~found, np.ones(rows), np.zeros(rows), found,
         )  # fmt: skip
 
     monkeypatch.setattr(module, "solve_commands", solve)
-    found = attack(model, 320, 4, seed=0)
+    found = adversarial_search(model, 320, 4, seed=0)
     judged = predict(model, found)
     assert 300 <= len(found) <= 340 and (found.stratum == "adversarial").all()
     assert judged.trusted.mean() > 0.3
@@ -323,7 +323,7 @@ def test_an_attack_finds_what_random_states_do_not(trunk, monkeypatch):
     random = predict(model, predicted_states(model, "inside", 80, 4, 0))
     assert np.median(random.uncertainty) < 0.6e-3
     assert judged.error[judged.trusted].max() > 2e-3
-    again = attack(model, 320, 4, seed=0)
+    again = adversarial_search(model, 320, 4, seed=0)
     np.testing.assert_array_equal(again.design, found.design)
 
 
@@ -369,7 +369,7 @@ def test_searches_go_on_below_the_limit_that_the_last_one_left(trunk, tmp_path, 
     known = [
         predicted_states(trunk, s, 10, 4, k, errors(1e-4)) for k, s in enumerate(strata_of(trunk.robot, buckles=False))
     ]
-    monkeypatch.setattr(module, "judged_states", lambda *_, **__: JudgedStates.join(known))
+    monkeypatch.setattr(module, "judged_states", lambda *_, **__: StratifiedStates.join(known))
     limits = []
 
     def search(model, count, states, seed, folder, number, workers):
@@ -377,8 +377,8 @@ def test_searches_go_on_below_the_limit_that_the_last_one_left(trunk, tmp_path, 
         found = predicted_states(model, "corners", 10, 4, 50 + number, errors(3e-3 if number == 1 else 1e-4))
         return replace(found, stratum=np.full(40, "adversarial"))
 
-    monkeypatch.setattr(module, "attack", search)
-    calibrate(folder, trunk.robot, bodies=10, states=4, attacks=40)
+    monkeypatch.setattr(module, "adversarial_search", search)
+    calibrate(folder, trunk.robot, bodies=10, states=4, adversarial_states=40)
     card = load_model(folder, trunk.robot).card
     assert limits[0] == trunk.robot.goal_tolerance > limits[1] > 0.0 and len(limits) == 2
     assert card["calibration"]["limits"] == limits and card["domain"]["limit"] == pytest.approx(limits[1], rel=1e-4)
@@ -396,7 +396,7 @@ def test_a_new_calibration_sets_its_own_limit_of_growth(trunk, tmp_path, monkeyp
     def known(model, *_):
         kinds = strata_of(model.robot, buckles=model.domain.limits_growth)
         assert "near buckling" not in kinds  # an earlier calibration's limit does not count
-        states = JudgedStates.join([predicted_states(model, kind, 10, 4, k, off) for k, kind in enumerate(kinds)])
+        states = StratifiedStates.join([predicted_states(model, kind, 10, 4, k, off) for k, kind in enumerate(kinds)])
         states.found[40 + np.array(lost, dtype=int)] = False
         return states
 
@@ -408,12 +408,12 @@ def test_a_new_calibration_sets_its_own_limit_of_growth(trunk, tmp_path, monkeyp
     monkeypatch.setattr(module, "judged_states", known)
     for largest in (2.0, 3.0):
         growth[:] = np.linspace(1.0, largest, 40)
-        calibrate(folder, trunk.robot, bodies=10, states=4, attacks=0)
+        calibrate(folder, trunk.robot, bodies=10, states=4, adversarial_states=0)
         card = load_model(folder, trunk.robot).card
         assert card["domain"]["growth"] == pytest.approx(np.quantile(growth, module.USUAL))
         assert card["calibration"]["limits_growth"] is True
     lost.clear()
-    calibrate(folder, trunk.robot, bodies=10, states=4, attacks=0)
+    calibrate(folder, trunk.robot, bodies=10, states=4, adversarial_states=0)
     card = load_model(folder, trunk.robot).card
     assert "growth" not in card["domain"] and card["calibration"]["limits_growth"] is False
 
@@ -424,7 +424,7 @@ def test_calibration_of_weights_from_start_to_end(tmp_path, monkeypatch):
     shutil.copytree(pretrained_folder(robot), folder)
     monkeypatch.setattr(module, "SEARCHES", 1)  # each takes seconds; for more see above
     arguments = ["trunk", "--weights", str(folder), "--folder", str(tmp_path / "states")]
-    arguments += ["--bodies", "6", "--states", "2", "--attacks", "16"]
+    arguments += ["--bodies", "6", "--states", "2", "--adversarial-states", "16"]
     result = CliRunner().invoke(calibrate_trust, arguments, catch_exceptions=False)
     assert result.exit_code == 0, result.output
     rows = json.loads(result.output)
@@ -437,7 +437,7 @@ def test_calibration_of_weights_from_start_to_end(tmp_path, monkeypatch):
     card = (folder / "model.json").read_text()
     # A second run finds all states, and the same calibration, although the weights have been calibrated.
     monkeypatch.setattr(strata, "_solve_body", None)
-    again = calibrate(folder, robot, bodies=6, states=2, attacks=16, state_folder=tmp_path / "states")
+    again = calibrate(folder, robot, bodies=6, states=2, adversarial_states=16, state_folder=tmp_path / "states")
     assert (folder / "model.json").read_text() == card
     assert again.keys() == rows.keys()
     kept = module.calibration_states(load_model(folder, robot), tmp_path / "states")
@@ -448,7 +448,7 @@ def test_weights_without_a_spread_are_refused(tmp_path):
     trunk = make_robot("trunk")
     save_model(load_model(pretrained_folder(trunk), trunk, members=1), tmp_path)
     with pytest.raises(WeightsError, match=r"two or more members.*have one member of kind 'potential'"):
-        calibrate(tmp_path, trunk, bodies=2, states=1, attacks=0)
+        calibrate(tmp_path, trunk, bodies=2, states=1, adversarial_states=0)
 
 
 # -- shipped weights --------------------------------------------------------------------------------------------------
@@ -466,7 +466,7 @@ def test_shipped_weights_hold_what_trust_promises(variant):
     assert model.domain.limit <= robot.goal_tolerance
     assert max(row["worst_trusted"] for row in rows.values()) <= robot.goal_tolerance
     assert all(row["unsolved"] == 0 for row in rows.values())
-    assert ("adversarial" in rows) == bool(model.card["calibration"]["attacks"])
+    assert ("adversarial" in rows) == bool(model.card["calibration"]["adversarial_states"])
     rows.pop("adversarial", None)
     rows.pop(module.TOUCHING, None)
     assert rows.keys() == set(strata_of(robot, buckles=model.domain.limits_growth))

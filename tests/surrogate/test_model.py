@@ -15,7 +15,7 @@ from softgym_envs.extensions.networks import residual
 from softgym_envs.surrogate import online
 from softgym_envs.surrogate.correction import fit_correction
 from softgym_envs.surrogate.data.dataset import load_dataset
-from softgym_envs.surrogate.model import Context, SurrogateModel, definite, softer
+from softgym_envs.surrogate.model import Context, SurrogateModel, definite, exceeds_softening
 from softgym_envs.surrogate.networks import NETWORKS
 from softgym_envs.surrogate.potential import kernels
 from softgym_envs.surrogate.potential.model import Model
@@ -197,10 +197,12 @@ def test_softer_states_are_those_whose_compliance_grew_by_more_than_the_factor(f
     growth = np.array(
         [max(np.linalg.eigvals(np.linalg.solve(K, unmoved[s])).real) for K, s in zip(stiffness, slot, strict=True)]
     )
-    found = softer(factor, stiffness, unmoved, slot)
+    found = exceeds_softening(factor, stiffness, unmoved, slot)
     assert 0 < found.sum() < 40
     assert (found == (growth > factor)).all()
-    assert softer(factor, np.full((1, 3, 3), np.nan), unmoved, slot[:1]).all()  # what is not known counts as soft
+    assert exceeds_softening(
+        factor, np.full((1, 3, 3), np.nan), unmoved, slot[:1]
+    ).all()  # what is not known counts as soft
 
 
 def test_a_row_without_a_definite_compliance_does_not_affect_others(monkeypatch):
@@ -280,7 +282,7 @@ def test_trust_ends_where_actuators_become_soft():
     model, _ = untrained_potential(robot)
     designs, displacement = random_states(robot, 200)
     context = model.context(designs)
-    found = model.growth(context, displacement)
+    found = model.softening_ratio(context, displacement)
     zero = np.zeros_like(displacement)
     # A single member judges the growth.
     first = Model(robot, online._member(model.tensors, 0), {})
@@ -289,7 +291,7 @@ def test_trust_ends_where_actuators_become_soft():
     )
     ratio = np.linalg.eigvals(np.linalg.solve(unmoved, W)).real.max(axis=1)
     np.testing.assert_allclose(found, ratio, rtol=1e-4)
-    np.testing.assert_allclose(model.growth(context, zero), 1.0, rtol=1e-6)
+    np.testing.assert_allclose(model.softening_ratio(context, zero), 1.0, rtol=1e-6)
     limit = float(np.median(found))
     # Young's modulus differs between the rows and has no influence.
     limited = Model(robot, model.tensors, {"domain": {"growth": limit}})

@@ -128,7 +128,7 @@ def test_the_growth_rises_to_learned_states_and_not_to_left_out_ones(model, midd
 
     def growth(data):
         tuned = fine_tune(strict, data, steps=3)
-        states = tuned.growth(tuned.context(data["design"]), data["displacement"])
+        states = tuned.softening_ratio(tuned.context(data["design"]), data["displacement"])
         return tuned.card["domain"]["growth"], states
 
     found, states = growth(middle)

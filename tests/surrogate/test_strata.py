@@ -13,7 +13,7 @@ from softgym_envs.surrogate.data.dataset import generate_dataset
 from softgym_envs.surrogate.data.sampling import SamplingPlan, pushed
 from softgym_envs.surrogate.data.strata import (
     Commands,
-    JudgedStates,
+    StratifiedStates,
     draw_commands,
     solve_commands,
     strata_of,
@@ -84,9 +84,9 @@ def test_states_are_the_equilibria_under_their_commands(tmp_path):
     assert (beyond[states.slack] > 1e-6).all() and np.abs(beyond[~states.slack]).max() <= 1e-6
     assert np.abs(states.effort[states.slack]).max() < 1e-6 * states.effort.max()
     states.save(tmp_path / "states.npz")
-    read = JudgedStates.load(tmp_path / "states.npz")
+    read = StratifiedStates.load(tmp_path / "states.npz")
     assert (read.effector == states.effector).all() and (read.stratum == states.stratum).all()
-    both = JudgedStates.join([states, read.rows(np.arange(4))])
+    both = StratifiedStates.join([states, read.rows(np.arange(4))])
     assert len(both) == 16 and np.unique(both.body).tolist() == [0, 1, 2, 3]
 
 

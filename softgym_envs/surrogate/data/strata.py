@@ -58,11 +58,11 @@ class Commands:
 
 
 @dataclass(frozen=True)
-class JudgedStates:
+class StratifiedStates:
     """Commands and the FEM equilibria they lead to, N states.
 
     Attributes:
-        stratum: one of `DRAWN`, or ``adversarial`` (see `softgym_envs.surrogate.calibration.attack`), shape (N,).
+        stratum: one of `DRAWN`, or ``adversarial`` (from `surrogate.calibration.adversarial_search`), shape (N,).
         body: number of the body, shape (N,).
         design: shape (N, d).
         command: commanded displacements, shape (N, n_a).
@@ -95,9 +95,9 @@ class JudgedStates:
     def __len__(self) -> int:
         return len(self.found)
 
-    def rows(self, index: np.ndarray) -> JudgedStates:
+    def rows(self, index: np.ndarray) -> StratifiedStates:
         """Return some of the states."""
-        return JudgedStates(*(getattr(self, f.name)[index] for f in fields(self)))
+        return StratifiedStates(*(getattr(self, f.name)[index] for f in fields(self)))
 
     def save(self, path: str | Path) -> None:
         """Write the states to an npz file."""
@@ -105,7 +105,7 @@ class JudgedStates:
             np.savez_compressed(stream, allow_pickle=False, **{f.name: getattr(self, f.name) for f in fields(self)})
 
     @classmethod
-    def load(cls, path: str | Path) -> JudgedStates:
+    def load(cls, path: str | Path) -> StratifiedStates:
         """Read the states that `save` wrote.
 
         Raises:
@@ -115,7 +115,7 @@ class JudgedStates:
         return cls(**read_npz(path, names))
 
     @classmethod
-    def join(cls, parts: list[JudgedStates]) -> JudgedStates:
+    def join(cls, parts: list[StratifiedStates]) -> StratifiedStates:
         """Return all states of several sets, with bodies numbered anew."""
         first = np.cumsum([0, *(part.body.max(initial=-1) + 1 for part in parts)])
         columns = {f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)}
@@ -208,7 +208,7 @@ def solve_commands(
     folder: str | Path | None = None,
     kept_only: bool = False,
     workers: int = 1,
-) -> JudgedStates:
+) -> StratifiedStates:
     """Return the FEM equilibria under commands; bodies that are infeasible or have no state at rest are left out.
 
     Each state is reached from the nearest state before it, as an environment reaches it. With ``second_start`` it is
@@ -226,24 +226,24 @@ def solve_commands(
     Raises:
         DataError: if no body is left then.
     """
-    parts: dict[int, JudgedStates] = {}
+    parts: dict[int, StratifiedStates] = {}
     missing = []
     for number in range(len(commands.design)):
         path = None if folder is None else Path(folder) / f"{_key(robot, commands, number, second_start)}.npz"
         if path is not None and path.exists():
-            parts[number] = JudgedStates.load(path)
+            parts[number] = StratifiedStates.load(path)
         else:
             missing.append((robot, commands, number, second_start, path))
     if not kept_only:
         parts |= parallel_map(_solve_and_keep, missing, workers)
     if not parts:
         raise DataError(f"'{folder}' holds no states of the stratum '{commands.stratum[0]}' with these commands")
-    return JudgedStates.join([parts[number] for number in sorted(parts)])
+    return StratifiedStates.join([parts[number] for number in sorted(parts)])
 
 
 def _solve_and_keep(
     robot: Robot, commands: Commands, number: int, second_start: bool, path: Path | None
-) -> tuple[int, JudgedStates]:
+) -> tuple[int, StratifiedStates]:
     """Return the number of a body and its states, and write them to a file."""
     part = _solve_body(robot, commands, number, second_start)
     if path is not None:
@@ -258,13 +258,13 @@ def _key(robot: Robot, commands: Commands, number: int, second_start: bool) -> s
     return hashlib.sha256(text.encode() + values).hexdigest()[:16]
 
 
-def _solve_body(robot: Robot, commands: Commands, number: int, second_start: bool) -> JudgedStates:
+def _solve_body(robot: Robot, commands: Commands, number: int, second_start: bool) -> StratifiedStates:
     """Return the states of one body; no rows if it is infeasible or has no state at rest."""
     count, size, span = len(robot.actuators), 3 * len(robot.effectors), robot.upper - robot.lower
     design = dict(zip(robot.design_space.names, commands.design[number].tolist(), strict=True))
     wanted = commands.command[number]
     rows = len(wanted)
-    part = JudgedStates(
+    part = StratifiedStates(
         stratum=np.full(rows, commands.stratum[number]),
         body=np.zeros(rows, dtype=np.int64),
         design=np.tile(commands.design[number], (rows, 1)),

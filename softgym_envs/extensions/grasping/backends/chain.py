@@ -13,7 +13,7 @@ import numpy as np
 from softgym_envs.backends.backend import Backend, State, check_numbers, refuse_force
 from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
-from softgym_envs.extensions.grasping.chain.contact import ChainBatch, Memory, Touching, rows_for
+from softgym_envs.extensions.grasping.chain.contact import ChainBatch, ChainContacts, Memory, rows_for
 from softgym_envs.extensions.grasping.chain.model import ChainModel, load_chain
 from softgym_envs.extensions.grasping.chain.rows import contact_rows
 from softgym_envs.extensions.grasping.robots.contact_aided_finger import ContactAidedFinger
@@ -152,7 +152,7 @@ class ChainBody:
     def _labels(self) -> tuple[Row, ...]:
         return (Row("servo", "rad", "N m"), *point_rows("tip"))
 
-    def _contacts(self, touch: Touching, clearance: float) -> Contacts:
+    def _contacts(self, touch: ChainContacts, clearance: float) -> Contacts:
         obstacle, point = np.nonzero(touch.pressing[0] > 0.0)
         force = np.column_stack([touch.forces[0, obstacle, point], np.zeros(len(point))])
         gap = touch.gaps[0, obstacle, point]

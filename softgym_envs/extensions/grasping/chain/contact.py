@@ -105,7 +105,7 @@ class ChainStates:
     found: np.ndarray
 
 
-class Touching(NamedTuple):
+class ChainContacts(NamedTuple):
     """What obstacles do to the points of the skin of B bodies; see `equilibrium.touching` for the shapes."""
 
     points: np.ndarray
@@ -237,7 +237,7 @@ class ChainBatch:
         """The present states."""
         return self.states_of(self.touching())
 
-    def states_of(self, touch: Touching) -> ChainStates:
+    def states_of(self, touch: ChainContacts) -> ChainStates:
         """Return the present states, given what obstacles do to the skin."""
         near = touch.pressing > 0.0
         return ChainStates(
@@ -253,16 +253,16 @@ class ChainBatch:
             found=self._found.copy(),
         )
 
-    def touching(self) -> Touching:
+    def touching(self) -> ChainContacts:
         """Return what obstacles do to the points of the skin."""
         found = self._touch(np.arange(len(self.slot)))
         relative = self._relative[:, None, None]
         return found._replace(forces=found.forces * relative[..., None], pressing=found.pressing * relative)
 
-    def _touch(self, rows: np.ndarray) -> Touching:
+    def _touch(self, rows: np.ndarray) -> ChainContacts:
         """Return what obstacles do to the points of chosen rows, at the baseline modulus."""
         count, obstacles, points, _ = self._anchors[rows].shape
-        found = Touching(
+        found = ChainContacts(
             np.zeros((count, points, 3)),
             np.zeros((count, obstacles, points)),
             np.zeros((count, obstacles, points, 2)),

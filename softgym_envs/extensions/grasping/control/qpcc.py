@@ -191,8 +191,8 @@ def solve_qpcc(
 
     for row in np.zeros((0, k), dtype=bool) if start is None else np.atleast_2d(start):
         improve(row)
-    nobody = np.zeros(k, dtype=bool)
-    stack = [(nobody, nobody)]
+    none_active = np.zeros(k, dtype=bool)
+    stack = [(none_active, none_active)]
     while stack and programs < max_programs:
         closed, opened = stack.pop()
         z = visit(closed, opened)
