@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from softgym_envs.errors import ConvergenceError as ConvergenceError
     from softgym_envs.errors import InfeasibleDesign as InfeasibleDesign
     from softgym_envs.errors import SoftGymError as SoftGymError
+    from softgym_envs.quantities import unchecked as unchecked
     from softgym_envs.robots.registry import make_robot as make_robot
     from softgym_envs.robots.registry import register_robot as register_robot
     from softgym_envs.version import __version__ as __version__
@@ -32,6 +33,7 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "envs.registration": ["ENVIRONMENTS", "register_environment"],
         "envs.tasks.registry": ["register_task"],
         "errors": ["ConvergenceError", "InfeasibleDesign", "SoftGymError"],
+        "quantities": ["unchecked"],
         "robots.registry": ["make_robot", "register_robot"],
         "version": ["__version__"],
     },

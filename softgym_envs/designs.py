@@ -14,6 +14,7 @@ from types import MappingProxyType
 import numpy as np
 
 from softgym_envs.errors import DesignError, unknown_name
+from softgym_envs.quantities import check_by_unit, check_unit
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,12 @@ class DesignVariable:
     def __post_init__(self) -> None:
         if not (math.isfinite(self.low) and math.isfinite(self.high)):
             raise DesignError(f"design variable '{self.name}': low {self.low} and high {self.high} must be finite")
+        try:
+            check_unit(self.unit, f"design variable '{self.name}'")
+            furthest = max(self.low, self.high, key=abs)
+            check_by_unit(self.unit, furthest, f"design variable '{self.name}': {'low' if furthest < 0.0 else 'high'}")
+        except ValueError as error:
+            raise DesignError(str(error)) from None
         if not self.low < self.high:
             raise DesignError(f"design variable '{self.name}': low {self.low} must be below high {self.high}")
         if not self.low <= self.baseline <= self.high:

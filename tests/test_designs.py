@@ -33,7 +33,7 @@ def spaces(draw):
         width = draw(st.floats(1e-3, 1e3)) * max(abs(low), 1e-6)
         fraction = draw(st.floats(0.0, 1.0))
         baseline = min(max(low + fraction * width, low), low + width)
-        variables.append(DesignVariable(f"v{k}", low, low + width, baseline, "m", "any", log=log))
+        variables.append(DesignVariable(f"v{k}", low, low + width, baseline, "1", "any", log=log))
     return DesignSpace(*variables)
 
 

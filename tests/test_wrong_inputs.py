@@ -53,7 +53,7 @@ class Leg(Robot):
     """A beam whose design has its modulus in MPa, and forgets to convert it."""
 
     name, effectors, size = "leg", ("tip",), 0.1
-    design_space = DesignSpace(DesignVariable("modulus", 10.0, 60.0, 35.0, "MPa", "stiffness of the leg"))
+    design_space = DesignSpace(DesignVariable("modulus", 10.0, 600.0, 35.0, "Pa", "stiffness of the leg"))
     actuators = (Actuator("push", low=0.0, high=0.01, rate=0.001),)
     effector_rest, effort_scale = np.array([0.1, 0.0, 0.0]), np.ones(1)
 
@@ -108,8 +108,8 @@ MISTAKES = {
     # Units
     "body in millimetres": (
         lambda _: body(1e3 * NODES),
-        "the body measures 100 x 20 x 20 m, more than 10 m; did you mean metres? (for nodes in millimetres pass "
-        "1e-3 * nodes)",
+        "the body measures 100 x 20 x 20 m; its size = 100 m is implausible, allowed: 0.001 to 10 m (*); did you mean "
+        "0.1 m (100 mm)? (for nodes in millimetres pass 1e-3 * nodes) if it is meant, set SOFTGYM_UNCHECKED=size",
     ),
     "effector in millimetres": (
         lambda _: body().add_effector("tip", np.array([100.0, 10.0, 10.0])),
@@ -128,8 +128,8 @@ MISTAKES = {
     ),
     "mesh file in millimetres without its unit": (
         lambda f: from_file(f),
-        "the body measures 100 x 20 x 20 m, more than 10 m; did you mean metres? (for a file in millimetres "
-        "pass unit='mm')",
+        "the body measures 100 x 20 x 20 m; its size = 100 m is implausible, *; did you mean 0.1 m (100 mm)? (for a "
+        "file in millimetres pass unit='mm', for one in metres unit='m') *",
     ),
     "goal in millimetres": (
         lambda _: reset(goal=[0.0, 50.0, -90.0]),
@@ -159,20 +159,20 @@ MISTAKES = {
     ),
     "modulus in megapascals": (
         lambda _: body(young_modulus=0.5),
-        "young_modulus = 0.5 Pa is less than 100 Pa, that of the softest gels; did you mean pascals? (for a value in "
-        "MPa pass 1e6 times it)",
+        "young_modulus = 0.5 Pa is implausible, allowed: 5000 to 2e+12 Pa (soft gels to diamond); did you mean 5e+05 "
+        "Pa (0.5 MPa)? if it is meant, set SOFTGYM_UNCHECKED=modulus",
     ),
     "modulus of a file in megapascals": (
         lambda f: from_file(f, unit="mm", young_modulus=0.5),
-        "young_modulus = 0.5 Pa is less than 100 Pa, *",
+        "young_modulus = 0.5 Pa is implausible, *",
     ),
     "modulus of one element in megapascals": (
         lambda _: body(young_modulus=lambda x: np.where(x[:, 0] > x[:, 0].min(), 3e6, 3.0)),
-        "young_modulus = 3 Pa is less than 100 Pa, *",
+        "young_modulus = 3 Pa is implausible, *",
     ),
     "modulus of a beam in megapascals": (
         lambda _: Leg().build(),
-        "young_modulus = 35 Pa is less than 100 Pa, *",
+        "young_modulus = 35 Pa is implausible, *",
     ),
     "Poisson's ratio in percent": (
         lambda _: body(poisson_ratio=45.0),

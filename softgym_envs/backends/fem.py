@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.backends.backend import Backend, PointForce, Snapshot, State, check_command, check_numbers
-from softgym_envs.backends.time_steps import TimeSteps
+from softgym_envs.backends.time_steps import TimeSteps, check_still
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import ContactModel
 from softgym_envs.mechanics.constraints.cable import Cable
@@ -21,6 +21,7 @@ from softgym_envs.mechanics.solvers.exact_compliance import exact_at
 from softgym_envs.mechanics.solvers.learned_errors import possible_errors
 from softgym_envs.mechanics.solvers.schemes import SCHEMES
 from softgym_envs.mechanics.solvers.statics import Statics
+from softgym_envs.quantities import check_quantity
 from softgym_envs.robots.base import TOUCH_RADIUS, Robot
 from softgym_envs.surrogate.domain import FOLDED, LOADED, SOFT, SPREAD
 from softgym_envs.wording import counted
@@ -88,6 +89,8 @@ class FEMBackend(Backend):
         self.robot = robot
         self.moving = dynamics
         self.steps = TimeSteps(control_step, time_step, mass_damping, stiffness_damping)
+        if not dynamics:
+            check_still(self.steps, scheme=(scheme, "euler"))
         self.step_options: dict[str, Any] = {
             "step": self.steps.step,
             "scheme": scheme,
@@ -208,6 +211,7 @@ class FEMBackend(Backend):
     def _checked_friction(self, friction: float) -> float:
         if not (np.isfinite(friction) and friction >= 0.0):
             raise ValueError(f"cable_friction = {friction} must be finite and not negative")
+        check_quantity("friction", friction, "cable_friction")
         if friction and self.moving:
             raise ValueError(f"cable_friction = {friction} is computed in statics only; allowed in dynamics: 0")
         return float(friction)

@@ -12,7 +12,7 @@ import numpy as np
 from softgym_envs.backends.backend import Backend, PointForce, Snapshot, State, check_command, refuse_force
 from softgym_envs.backends.batch import BatchBackend, BatchState
 from softgym_envs.backends.surrogate_motion import MotionState, SurrogateMotion
-from softgym_envs.backends.time_steps import TimeSteps
+from softgym_envs.backends.time_steps import TimeSteps, check_still
 from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 from softgym_envs.mechanics.condensation import CondensedModel
@@ -270,6 +270,7 @@ def _motion_of(
     if not isinstance(dynamics, bool):
         raise ValueError(f"dynamics = {dynamics!r} is unknown; allowed: True, False")
     if not dynamics:
+        check_still(steps)
         return None
     folder = pretrained_folder(model.robot) if weights is None else Path(weights)
     return SurrogateMotion(model, read_inertia(folder, model.robot), steps)

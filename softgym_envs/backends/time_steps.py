@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from softgym_envs.quantities import check_quantity
+
 MAX_STEPS = 10_000
 """Largest number of time steps in a control step: more would run for minutes, and a unit is probably wrong."""
 
@@ -42,6 +44,7 @@ class TimeSteps:
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0.0):
                 raise ValueError(f"{name} = {value} s must be positive and finite")
+            check_quantity("duration", value, name)
         if self.control_step > MAX_STEPS * self.time_step:
             raise ValueError(
                 f"time_step = {self.time_step:g} s divides control_step = {self.control_step:g} s into more than "
@@ -51,6 +54,8 @@ class TimeSteps:
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0.0):
                 raise ValueError(f"{name} = {value} must be finite and not negative")
+        check_quantity("damping_rate", self.mass_damping, "mass_damping")
+        check_quantity("duration", self.stiffness_damping, "stiffness_damping")
 
     @property
     def count(self) -> int:
@@ -68,3 +73,19 @@ class TimeSteps:
         parts = start + share * (end - start)
         parts[-1] = end  # without round-off
         return parts
+
+
+def check_still(steps: TimeSteps, **others: tuple[object, object]) -> None:
+    """Refuse options of motion on a backend that computes none.
+
+    Args:
+        steps: its time steps and damping.
+        **others: further options, each with its value and its default.
+
+    Raises:
+        ValueError: naming an option that is not at its default.
+    """
+    options = {field.name: (getattr(steps, field.name), field.default) for field in fields(TimeSteps)} | others
+    for name, (value, default) in options.items():
+        if value != default:
+            raise ValueError(f"{name} = {value!r} has no effect without dynamics=True")

@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from softgym_envs.backends.registry import check_backend, is_batched
+from softgym_envs.backends.time_steps import shared_options
 from softgym_envs.designs import Design, DesignSpace
 from softgym_envs.envs.plant import Plants
 from softgym_envs.envs.spaces import AgentSpaces
@@ -149,7 +150,10 @@ def set_up(robot: RobotSource | None, task: TaskSource, backend: str | None, opt
     if backend is None:
         backend = default_backend(made, backend_options)
     if backend == defaults.get("backend"):
-        backend_options = {**defaults.get("backend_options", {}), **backend_options}
+        usual = defaults.get("backend_options", {})
+        if not backend_options.get("dynamics", True):  # without motion, its options have no effect
+            usual = {name: value for name, value in usual.items() if name not in shared_options(usual)}
+        backend_options = {**usual, **backend_options}
     check_backend(backend, made, backend_options)
     space = made.design_space
     plant = defaults.get("plant") if options.plant is None else options.plant

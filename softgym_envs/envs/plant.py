@@ -11,6 +11,7 @@ import numpy as np
 from softgym_envs.backends.backend import PointForce, State
 from softgym_envs.errors import unknown_name
 from softgym_envs.mechanics.condensation import CondensedModel
+from softgym_envs.quantities import QUANTITIES
 from softgym_envs.robots.base import Robot
 
 
@@ -68,7 +69,7 @@ def play(command: np.ndarray, last: np.ndarray, width: np.ndarray) -> np.ndarray
 
 LIMITS: dict[str, tuple[float, float]] = {
     "stiffness": (0.1, 10.0),
-    "cable_friction": (0.0, 5.0),
+    "cable_friction": (0.0, QUANTITIES["friction"].high),
     "delay": (0, 100),
     "noise": (0.0, 1.0),
     "gain": (0.1, 10.0),

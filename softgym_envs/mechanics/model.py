@@ -33,7 +33,6 @@ from softgym_envs.mechanics.mesh_checks import check_held
 from softgym_envs.mechanics.rods import Rod
 from softgym_envs.mechanics.skins import Skin
 from softgym_envs.mechanics.solids import (
-    MAX_BODY_SIZE,
     Fixed,
     PerElement,
     are_rows,
@@ -47,8 +46,12 @@ from softgym_envs.mechanics.solids import (
 )
 from softgym_envs.mechanics.surfaces import cavity_around
 from softgym_envs.mechanics.warping import Warping
+from softgym_envs.quantities import check_quantity
 
 announce_compilation()
+
+FAR = 5.0
+"""Largest gap between a body and an obstacle, in lengths of the body; one that is farther away has another unit."""
 
 
 class MechanicalModel:
@@ -79,6 +82,7 @@ class MechanicalModel:
         rods: beams along a line, from `ModelBuilder.add_rod`.
         named_loads: loads from `add_load` by name.
         contact: what the surface of the body touches, or None; see `set_contact`.
+        gravity: acceleration [m/s2], shape (3,); see `set_gravity`.
         kinematics: degrees of freedom, and the motions that belong to them.
         solver: name of the linear solver.
     """
@@ -153,7 +157,6 @@ class MechanicalModel:
         regions: Mapping[str, np.ndarray] | None = None,
         gravity: Sequence[float] = (0.0, 0.0, 0.0),
         solver: str = "auto",
-        max_size: float = MAX_BODY_SIZE,
         check: bool = True,
     ) -> MechanicalModel:
         """Make a model of one material from any tetrahedral mesh.
@@ -167,14 +170,13 @@ class MechanicalModel:
             element: ``"linear"``, ``"averaged"`` (no locking near a Poisson's ratio of 0.5) or ``"quadratic"``.
             material: a `Material` or its name.
             young_modulus: [Pa]; one number, an array (m,), a mapping of region names to numbers, or a function of the
-                elements' centroids [m] (m, 3). Less than 100 Pa is rejected as a unit mistake.
+                elements' centroids [m] (m, 3).
             poisson_ratio: inside (-1, 0.5), in the same forms.
             density: [kg/m3].
             total_mass: mass of the body [kg], instead of the density.
             regions: elements of each region by name, see `read_mesh`.
             gravity: acceleration [m/s2], shape (3,).
             solver: name of the linear solver, see `make_solver`.
-            max_size: largest allowed side of the body [m]; a longer one is rejected as a unit mistake.
             check: refuse meshes that are not one body: repeated, folded or overlapping elements, nodes that are not
                 merged, and faces that lie on each other. False allows cuts of no width.
 
@@ -193,10 +195,13 @@ class MechanicalModel:
             density=density,
             total_mass=total_mass,
             regions=regions,
-            max_size=max_size,
             check=check,
         )
         check_modulus(part.options["young_modulus"])
+        if part.fixed.all():
+            raise ValueError(
+                f"all {len(part.fixed)} nodes are fixed: nothing can move; did you mean metres where you chose them?"
+            )
         block = part.kind(part.nodes, part.connectivity, **part.options)
         model = cls(part.nodes, [block], fixed=part.fixed, gravity=gravity, solver=solver)
         model._check_held()
@@ -230,10 +235,10 @@ class MechanicalModel:
         Raises:
             DataError: if the file is missing or unreadable, or its surface is open or intersects itself.
             MeshingError: if gmsh cannot be used, or takes too long.
-            ValueError: if no node is fixed, or the body is larger than ``max_size``.
+            ValueError: if no node is fixed, or the size of the body is implausible.
         """
         mesh = read_mesh(path, scale=scale, unit=unit, mesh_size=mesh_size, time_limit=time_limit)
-        check_size(mesh.nodes, options.get("max_size", MAX_BODY_SIZE), "for a file in millimetres pass unit='mm'")
+        check_size(mesh.nodes, "for a file in millimetres pass unit='mm', for one in metres unit='m'")
         if (fixed is None) == (fixed_box is None):
             raise ValueError("pass the clamped nodes as either 'fixed' or 'fixed_box'")
         if fixed_box is not None:
@@ -459,7 +464,22 @@ class MechanicalModel:
             settings = replace(settings, stiffness=stiffness)
         skins = [skin for skin in self.skins if skin.touches]
         self.contact = Contact(surface_of(self.nodes, self.blocks, skins, excluded), obstacles, settings)
+        self._check_near(self.contact)
         return self.contact
+
+    def _check_near(self, contact: Contact) -> None:
+        """Raise ValueError for obstacles far from the body, and for a distance of contact that is large beside it."""
+        points = contact.surface.points[0] @ self.nodes
+        if not len(points):
+            return
+        size = float(np.linalg.norm(np.ptp(points, axis=0)))
+        example = f"a tenth of the body, which is {size:.3g} m long"
+        check_quantity("contact_distance", contact.distance, "distance of contact", high=0.1 * size, example=example)
+        for obstacle in contact.obstacles:
+            if obstacle.frame is None:
+                label = f"gap between the body and obstacle '{obstacle.name or obstacle.kind}'"
+                gap = max(obstacle.distance_to(points), 0.0)
+                check_quantity("length", gap, label, high=FAR * size, example=f"{FAR:g} times the body's length")
 
     # -- loads ------------------------------------------------------------------------------------------------------
 
@@ -468,6 +488,8 @@ class MechanicalModel:
         acceleration = np.asarray(gravity, dtype=float)
         if acceleration.shape != (3,) or not np.isfinite(acceleration).all():
             raise ValueError(f"gravity must be three finite numbers, got {gravity!r}")
+        check_quantity("gravity", np.linalg.norm(acceleration), f"gravity {tuple(acceleration.tolist())}: length")
+        self.gravity = acceleration
         self._gravity_forces[:] = 0.0
         if acceleration.any():
             for block in self.blocks:
@@ -535,6 +557,12 @@ class MechanicalModel:
     def frames(self) -> Frames:
         """Frames and the rows they carry."""
         return self.kinematics.frames
+
+    @property
+    def places(self) -> np.ndarray:
+        """Rest positions of mesh nodes and of the origins of frames [m], shape (k, 3)."""
+        directors = self.frames.carried[self.frames.moves == 0.0]
+        return np.delete(self.nodes, directors, axis=0)
 
     @property
     def equations(self) -> int:

@@ -14,6 +14,7 @@ from softgym_envs.mechanics.elements.averaged import AveragedTetrahedra
 from softgym_envs.mechanics.elements.quadratic import EDGES, QuadraticTetrahedra, add_midside_nodes
 from softgym_envs.mechanics.elements.tetrahedra import SolidBlock, Tetrahedra, check_nodes
 from softgym_envs.mechanics.mesh_checks import check_mesh
+from softgym_envs.quantities import check_quantity
 
 SOLIDS: dict[str, type[SolidBlock]] = {
     "linear": Tetrahedra,
@@ -21,13 +22,6 @@ SOLIDS: dict[str, type[SolidBlock]] = {
     "quadratic": QuadraticTetrahedra,
 }
 """Solid elements by name."""
-
-MAX_BODY_SIZE = 10.0
-"""Largest side [m] of a body; a longer one is rejected as a unit mistake."""
-
-MIN_YOUNG_MODULUS = 100.0
-"""Smallest Young's modulus [Pa] of the parts of a robot, and of a mesh of one material: that of the softest gels. A
-smaller one is rejected as a unit mistake. `ModelBuilder` takes any, for models in units without dimensions."""
 
 PerElement = float | np.ndarray | Mapping[str, float] | Callable[[np.ndarray], np.ndarray]
 """A value for all elements, one for each (m,), one for each region by name, or a function of the centroids (m, 3)."""
@@ -65,7 +59,6 @@ def solid_part(
     poisson_ratio: PerElement = 0.3,
     total_mass: float | None = None,
     regions: Mapping[str, np.ndarray] | None = None,
-    max_size: float = MAX_BODY_SIZE,
     check: bool = True,
     **options: Any,
 ) -> SolidPart:
@@ -73,7 +66,7 @@ def solid_part(
     if element not in SOLIDS:
         raise ValueError(unknown_name("element", element, SOLIDS))
     nodes, tetrahedra = check_nodes(nodes), np.asarray(tetrahedra)
-    check_size(nodes, max_size, "for nodes in millimetres pass 1e-3 * nodes")
+    check_size(nodes, "for nodes in millimetres pass 1e-3 * nodes")
     if check:
         check_mesh(nodes, tetrahedra[:, :4] if tetrahedra.ndim == 2 else tetrahedra)
     mask = fixed_mask(fixed(nodes) if callable(fixed) else fixed, len(nodes))
@@ -90,7 +83,11 @@ def solid_part(
     if total_mass is not None:
         if not (np.isfinite(total_mass) and total_mass > 0.0):
             raise ValueError(f"total_mass = {total_mass} kg must be positive and finite")
-        options["density"] = total_mass / kind(nodes, tetrahedra).volume  # type: ignore[call-arg]
+        density = total_mass / kind(nodes, tetrahedra).volume  # type: ignore[call-arg]
+        check_quantity(
+            "density", density, f"total_mass = {total_mass:g} kg: density", factors={"total_mass in g": 1e-3}
+        )
+        options["density"] = density
     return SolidPart(nodes, tetrahedra, mask, kind, options)
 
 
@@ -130,31 +127,28 @@ def are_rows(numbers: np.ndarray, count: int) -> bool:
     return numbers.dtype.kind in "iu" and bool(((numbers >= 0) & (numbers < count)).all())
 
 
-def check_size(nodes: np.ndarray, max_size: float, hint: str) -> None:
-    """Reject a body whose largest side [m] exceeds a limit.
+def check_size(nodes: np.ndarray, hint: str) -> None:
+    """Reject a body whose largest side [m] is not plausible.
 
     Raises:
         ValueError: with a hint on how to correct the unit.
     """
     sides = np.ptp(nodes, axis=0) if len(nodes) else np.zeros(3)
-    if sides.max() > max_size:
-        spans = " x ".join(f"{side:.3g}" for side in sides)
-        raise ValueError(f"the body measures {spans} m, more than {max_size:g} m; did you mean metres? ({hint})")
+    spans = " x ".join(f"{side:.3g}" for side in sides)
+    check_quantity("size", sides.max(), f"the body measures {spans} m; its size", hint=hint)
 
 
 def check_modulus(young_modulus: ArrayLike) -> None:
-    """Reject Young's moduli [Pa] that are softer than any gel; those that are not positive are left to the elements.
+    """Reject Young's moduli [Pa] that are not plausible; those that are not positive are left to the elements.
+
+    Only parts of a robot, a mesh of one material and `SolidBlock.set_elasticity` are checked: `ModelBuilder` takes any,
+    for models in units without dimensions.
 
     Raises:
         ValueError: with a hint on how to correct the unit.
     """
-    values = np.ravel(young_modulus)
-    soft = values[(values > 0.0) & (values < MIN_YOUNG_MODULUS)]
-    if soft.size:
-        raise ValueError(
-            f"young_modulus = {soft.min():g} Pa is less than {MIN_YOUNG_MODULUS:g} Pa, that of the softest gels; did "
-            "you mean pascals? (for a value in MPa pass 1e6 times it)"
-        )
+    values = np.ravel(np.asarray(young_modulus, dtype=float))
+    check_quantity("modulus", values[values > 0.0], "young_modulus")
 
 
 def check_distance(points: np.ndarray, nodes: np.ndarray, name: str, sizes: float) -> None:

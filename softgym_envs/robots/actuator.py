@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from softgym_envs.quantities import check_by_unit, check_unit
+
 
 @dataclass(frozen=True)
 class Actuator:
@@ -16,13 +18,13 @@ class Actuator:
         low: smallest commanded displacement [unit].
         high: largest commanded displacement [unit].
         rate: largest change of the command per control step [unit].
-        unit: unit of displacement.
+        unit: SI unit of displacement.
         unilateral: whether it cannot push.
         max_effort: largest effort either way; beyond it a commanded displacement is not reached.
 
     Raises:
-        ValueError: for an empty or infinite range, one without zero, which is the command at rest, or a rate or largest
-            effort that is not positive.
+        ValueError: for a unit that is not SI, an empty, infinite or implausible range, one without zero, which is the
+            command at rest, a rate or largest effort that is not positive, or a rate beyond the range.
     """
 
     name: str
@@ -35,6 +37,7 @@ class Actuator:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
+        check_unit(self.unit, f"actuator '{self.name}'")
         if not (np.isfinite([self.low, self.high]).all() and self.low < self.high):
             raise ValueError(f"actuator '{self.name}': low {self.low:g} must be below high {self.high:g}, both finite")
         if not self.low <= 0.0 <= self.high:
@@ -45,3 +48,11 @@ class Actuator:
         for label, value in (("rate", self.rate), ("max_effort", self.max_effort)):
             if not value > 0.0:
                 raise ValueError(f"actuator '{self.name}': {label} = {value:g} must be positive")
+        furthest = max(self.low, self.high, key=abs)
+        check_by_unit(self.unit, furthest, f"actuator '{self.name}': {'high' if furthest > 0.0 else 'low'}")
+        span = self.high - self.low
+        if span < self.rate < np.inf:
+            raise ValueError(
+                f"actuator '{self.name}': rate = {self.rate:g} {self.unit} in a control step exceeds its range of "
+                f"{span:g} {self.unit}; check its unit, or pass inf for no limit"
+            )

@@ -13,14 +13,21 @@ from typing import Any, TypeVar
 import numpy as np
 
 from softgym_envs.designs import Design, DesignSpace
-from softgym_envs.errors import InfeasibleDesign, SoftGymError, unknown_name
+from softgym_envs.errors import InfeasibleDesign, SoftGymError
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.contact.contact import ContactSettings
 from softgym_envs.mechanics.contact.obstacles import Obstacle, obstacle_from
 from softgym_envs.mechanics.materials import resolve_material
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.solids import check_modulus
 from softgym_envs.robots.actuator import Actuator as Actuator
+from softgym_envs.robots.checks import (
+    CONTACT_DEFAULTS,
+    WatchedDesign,
+    check_built,
+    check_defined,
+    check_robot,
+    warn_unread,
+)
 from softgym_envs.robots.geometry.meshing import BodyMesh
 from softgym_envs.robots.geometry.morphing import Feature, Morpher
 from softgym_envs.robots.geometry.symmetry import Symmetry
@@ -31,28 +38,11 @@ F = TypeVar("F", bound=Callable[..., None])
 Drawing = tuple[Callable[..., None], dict]
 """A module-level function that draws one volume with gmsh in millimetres, and its parameters (JSON-serialisable)."""
 
-MAX_LENGTH = 10.0
-"""Largest allowed robot, stroke or dimension [m]; larger ones were probably given in millimetres."""
-
-PUBLISHED = "published"
-"""Name of the design box that every robot has: the bounds with which its class defines its design space."""
-
-CONTACT_DEFAULTS: dict[str, object] = {
-    "obstacles": (),
-    "self_contact": False,
-    "self_friction": 0.0,
-    "contact_distance": 5e-4,
-    "contact_stiffness": None,
-}
-"""Options of a robot that touches nothing. They are not part of its key."""
-
 DEFAULTS_NOT_IN_KEY: dict[str, object] = CONTACT_DEFAULTS | UNIFORM | {"sealed": False, "touch": False}
 """Values of options that are not part of a robot's key."""
 
 TOUCH_RADIUS = 2.5e-3
 """Radius of the part of a body on which a touch acts [m]. At a single point, the compliance depends on the mesh."""
-
-_REQUIRED = ("name", "effectors", "size", "design_space", "actuators", "effector_rest", "effort_scale")
 
 
 def _recording_options(init: F) -> F:
@@ -73,16 +63,9 @@ def _recording_options(init: F) -> F:
             recorded.setdefault(name, value)
         init(self, *args, **kwargs)
         if outermost:
-            self._check_attributes()
+            check_robot(self)
 
     return wrapper  # type: ignore[return-value]
-
-
-def _check_defined(holder: object, cls: type) -> None:
-    """Raise TypeError if an attribute that every robot needs is missing in a class, or in a new robot of it."""
-    missing = [name for name in _REQUIRED if not hasattr(holder, name)]
-    if missing:
-        raise TypeError(f"robot class '{cls.__name__}' does not define: {', '.join(missing)} (see Robot)")
 
 
 class Robot(ABC):
@@ -132,6 +115,7 @@ class Robot(ABC):
         made_of_beams: bodies are quadratic beams and rigid parts, moved by servos or chambers; finite elements step
             many of them at once.
         backends: backends of its own, ``"module:class"``, by the name that they replace or add.
+        always_touches: whether the options of contact matter without obstacles and self-contact.
         symmetries: reflections and rotations, besides the identity, that map every body and its mesh to itself.
             Surrogates also learn from the images of their states.
         non_mechanical_options: options that do not change the condensed model.
@@ -160,7 +144,9 @@ class Robot(ABC):
     design_boxes: Mapping[str, Mapping[str, tuple[float, float]]] = {}
     symmetries: tuple[Symmetry, ...] = ()
     non_mechanical_options: tuple[str, ...] = ("unilateral", "design_box")
+    always_touches: bool = False
     _options: dict[str, object]
+    _built: bool = False
 
     def __init_subclass__(cls, **options: object) -> None:
         super().__init_subclass__(**options)
@@ -170,7 +156,7 @@ class Robot(ABC):
         own_constructor = any("__init__" in vars(base) for base in cls.__mro__[:-1] if base.__module__ != __name__)
         abstract = any(getattr(getattr(cls, name, None), "__isabstractmethod__", False) for name in dir(cls))
         if not (own_constructor or abstract):
-            _check_defined(cls, cls)
+            check_defined(cls, cls)
 
     @_recording_options
     def __init__(
@@ -272,9 +258,12 @@ class Robot(ABC):
         """
         complete = self.design_space.complete(design)
         try:
-            model = self.assemble(complete)
-            self._check_rows(model)
-            check_modulus([block.largest_young_modulus for block in model.blocks])
+            watched = WatchedDesign(complete)
+            model = self.assemble(watched)
+            check_built(self, model, complete)
+            if not self._built:
+                warn_unread(self, watched)
+                self._built = True
             self._add_contact(model, complete)
             return model
         except SoftGymError:
@@ -282,17 +271,6 @@ class Robot(ABC):
         except Exception as error:
             error.add_note(f"while assembling robot '{self.name}' for {complete}")
             raise
-
-    def _check_rows(self, model: MechanicalModel) -> None:
-        """Raise ValueError for a model without the actuators and effectors that the class declares, in their order."""
-        if not isinstance(model, MechanicalModel):
-            raise ValueError(f"robot '{self.name}': assemble must return a MechanicalModel, got {model!r}")
-        declared = {"a": tuple(actuator.name for actuator in self.actuators), "e": tuple(self.effectors)}
-        for role, kind in (("a", "actuators"), ("e", "effectors")):
-            added = tuple(constraint.name for constraint in model.constraints[role])
-            if added != declared[role]:
-                wanted, got = (", ".join(names) or "none" for names in (declared[role], added))
-                raise ValueError(f"robot '{self.name}': assemble must add the {kind} {wanted} in this order, got {got}")
 
     def printable(self) -> Robot:
         """Return the robot whose solid parts are this one's body; it takes the same designs."""
@@ -324,15 +302,27 @@ class Robot(ABC):
         return bool(self.obstacles) or self.self_contact
 
     @property
+    def may_touch(self) -> bool:
+        """Whether options of contact matter."""
+        return self.touches or self.always_touches or type(self).own_obstacles is not Robot.own_obstacles
+
+    @property
+    def options(self) -> dict[str, object]:
+        """The arguments of the constructor by name, defaults included.
+
+        If the robot has an attribute of the same name, for example because a default depends on other options, this is
+        the attribute's value.
+        """
+        return {name: vars(self).get(name, value) for name, value in self._options.items()}
+
+    @property
     def mechanics_key(self) -> dict[str, Any]:
         """All options that change the mechanics, JSON-serialisable. Weights are valid for exactly one key.
 
-        The options are the arguments of the constructor, defaults included. If the robot has an attribute of the
-        same name, for example because a default depends on other options, the attribute's value is used. Options of
-        contact, of meshes and of single robots are left out at their simplest values (`DEFAULTS_NOT_IN_KEY`).
+        Of the `options`, those of contact, of meshes and of single robots are left out at their simplest values
+        (`DEFAULTS_NOT_IN_KEY`).
         """
-        values = {name: vars(self).get(name, value) for name, value in self._options.items()}
-        values |= {name: vars(self)[name] for name in FOLLOWING if vars(self).get(name)}
+        values = self.options | {name: vars(self)[name] for name in FOLLOWING if vars(self).get(name)}
         return {
             name: _json_value(value, f"option '{name}' of robot '{self.name}'")
             for name, value in values.items()
@@ -379,45 +369,6 @@ class Robot(ABC):
                 f"'{self.name}', whose size is {self.size:g} m; did you mean metres?"
             )
         return array
-
-    def _check_attributes(self) -> None:
-        """Complete and check a new robot.
-
-        Raises:
-            TypeError: naming the attributes that the class does not define.
-            ValueError: for an unknown design box, arrays of a wrong shape, or lengths that are probably not in metres.
-        """
-        _check_defined(self, type(self))
-        boxes = {PUBLISHED: {}, **self.design_boxes}
-        if self.design_box not in boxes:
-            raise ValueError(f"robot '{self.name}': {unknown_name('design_box', self.design_box, boxes)}")
-        if bounds := boxes[self.design_box]:
-            self.design_space = self.design_space.within(bounds)
-        if isinstance(self.effectors, str):
-            raise TypeError(f"robot '{self.name}': effectors must be a tuple of names, got {self.effectors!r}")
-        if not hasattr(self, "workspace_scale"):
-            self.workspace_scale = 0.25 * self.size
-        if self.touches and self.contact_stiffness is not None:
-            self.stiffness_variable = None  # this stiffness does not scale with that of the body
-        for name, count in (("effector_rest", 3), ("effort_scale", len(self.actuators))):
-            value = np.asarray(getattr(self, name), dtype=float)
-            if value.shape != (count,):
-                raise ValueError(f"robot '{self.name}': {name} must have shape ({count},), got {value.shape}")
-            if not np.isfinite(value).all():
-                raise ValueError(f"robot '{self.name}': {name} must be finite, got {value.tolist()}")
-            setattr(self, name, value)
-        # Rewards and observations are divided by these.
-        for name in ("size", "effort_scale", "sensor_scale", "goal_tolerance", "workspace_scale"):
-            value = np.asarray(getattr(self, name), dtype=float)
-            if not (np.isfinite(value) & (value > 0.0)).all():
-                raise ValueError(f"robot '{self.name}': {name} must be positive and finite, got {value.tolist()}")
-        lengths = {"size": self.size, "effector_rest": float(np.abs(self.effector_rest).max())}
-        bounded = [(a.name, a.high, a.unit) for a in self.actuators]
-        bounded += [(v.name, v.high, v.unit) for v in self.design_space]
-        lengths |= {f"high of '{name}'": high for name, high, unit in bounded if unit == "m"}
-        for label, length in lengths.items():
-            if length > MAX_LENGTH:
-                raise ValueError(f"robot '{self.name}': {label} = {length:g} m; did you mean {1e-3 * length:g} m?")
 
 
 def _json_value(value: Any, label: str) -> Any:

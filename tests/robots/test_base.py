@@ -159,7 +159,7 @@ def test_attributes_may_be_set_after_the_base_constructor():
 
         def __init__(self):
             super().__init__()
-            self.actuators = (Actuator("a", 0.0, 1.0, 0.1), Actuator("b", 0.0, 1.0, 0.1, unilateral=False))
+            self.actuators = (Actuator("a", 0.0, 0.1, 0.01), Actuator("b", 0.0, 0.1, 0.01, unilateral=False))
             self.effort_scale = np.ones(2)
 
     np.testing.assert_array_equal(Late().unilateral, [True, False])
@@ -171,21 +171,25 @@ def test_attributes_may_be_set_after_the_base_constructor():
         ({"effectors": "tip"}, TypeError, "effectors must be a tuple of names, got 'tip'"),
         ({"effort_scale": [1.0, 2.0]}, ValueError, r"effort_scale must have shape \(1,\), got \(2,\)"),
         ({"effector_rest": [0.0, 1.0]}, ValueError, r"effector_rest must have shape \(3,\), got \(2,\)"),
-        ({"effector_rest": [0.0, 0.0, 50.0]}, ValueError, "effector_rest = 50 m; did you mean 0.05 m?"),
-        ({"size": 50.0}, ValueError, "robot 'odd': size = 50 m; did you mean 0.05 m?"),
+        (
+            {"effector_rest": [0.0, 0.0, 50.0]},
+            ValueError,
+            r"effector_rest = 50 m is implausible.* did you mean 0.05 m \(50 mm\)\?",
+        ),
+        ({"size": 50.0}, ValueError, r"robot 'odd': size = 50 m is implausible, .* did you mean 0.05 m \(50 mm\)\?"),
         ({"size": -0.1}, ValueError, "robot 'odd': size must be positive and finite, got -0.1"),
         ({"effort_scale": [0.0]}, ValueError, r"effort_scale must be positive and finite, got \[0.0\]"),
         ({"goal_tolerance": np.nan}, ValueError, "goal_tolerance must be positive and finite, got nan"),
         ({"effector_rest": [0.0, np.nan, 0.0]}, ValueError, r"effector_rest must be finite, got \[0.0, nan, 0.0\]"),
         (
-            {"actuators": (Actuator("cable", 0.0, 20.0, 1.0),)},
+            {"actuators": (Actuator("cable", 0.0, 5.0, 1.0),)},
             ValueError,
-            "'cable' = 20 m; did you mean 0.02 m",
+            r"stroke of actuator 'cable' = 5 m is implausible, allowed: 0 to 0.1 m .*; did you mean 0.005 m \(5 mm\)\?",
         ),
         (
-            {"design_space": DesignSpace(DesignVariable("length", 30.0, 70.0, 50.0, "m", "in millimetres"))},
+            {"design_space": DesignSpace(DesignVariable("length", 3.0, 7.0, 5.0, "m", "in centimetres"))},
             ValueError,
-            "high of 'length' = 70 m; did you mean 0.07 m",
+            r"design variable 'length' = 7 m is implausible, allowed: 0 to 0.5 m",
         ),
     ],
     ids=[
@@ -295,3 +299,67 @@ def test_controllers_of_robots(name):
         np.testing.assert_array_equal(controller.goal_weights, robot.goal_axes)
     faster = InverseQP.for_robot(robot, rates=2.0 * robot.rates)
     np.testing.assert_array_equal(faster.rates, 2.0 * robot.rates)
+
+
+# -- what a built body says of its robot -----------------------------------------------------------------------------
+
+
+def heavy(self, design):
+    """Assemble a spike whose weight no option gives."""
+    model = Spike.assemble(self, design)
+    model.set_gravity((0.0, 0.0, -9.81))
+    return model
+
+
+def in_other_unit(self, design):
+    """Assemble a spike whose actuator measures another quantity than the class declares."""
+    model = Spike.assemble(self, design)
+    model.constraints["a"][0].unit = ("rad", "N m")
+    return model
+
+
+@pytest.mark.parametrize(
+    ("attributes", "options", "message"),
+    [
+        (
+            {},
+            {"gravity": (0.0, 0.0, -9.81)},
+            r"option gravity = \(0.0, 0.0, -9.81\) m/s2 has no effect: assemble builds",
+        ),
+        ({"assemble": heavy}, {}, r"option gravity = .*\(0.0, 0.0, -9.81\); pass gravity=self.gravity"),
+        ({"assemble": in_other_unit}, {}, "actuator 'cable' is declared in m, but assemble adds one in rad"),
+        (
+            {"effector_rest": [0.0, 0.0, 0.0]},
+            {},
+            "effector 'tip' of the baseline body .* 0.05 m away from effector_rest",
+        ),
+    ],
+    ids=["ignored gravity", "own gravity", "unit of an actuator", "effector"],
+)
+def test_a_body_must_be_what_its_robot_says(attributes, options, message):
+    robot = type("Said", (Spike,), {"name": "said", **attributes})(**options)
+    with pytest.raises(ValueError, match=message):
+        robot.build()
+
+
+def test_design_variables_that_assemble_never_reads_are_named_once():
+    misspelt = DesignSpace(*Spike.design_space, DesignVariable("widht", 0.01, 0.02, 0.01, "m", "never read"))
+    robot = type("Unread", (Spike,), {"name": "unread", "design_space": misspelt})()
+    with pytest.warns(UserWarning, match="robot 'unread': assemble never reads the design variable widht: it changes"):
+        robot.build()
+    robot.build({"widht": 0.02})  # told once
+    make_robot(Spike).build()  # nothing to tell
+
+
+@pytest.mark.parametrize("use", [dict, lambda design: design.array, hash, lambda design: {**design}, str])
+def test_using_a_whole_design_reads_its_variables(use):
+    def assemble(self, design):
+        use(design)
+        return Spike.assemble(self, dict(Spike.design_space.baseline))
+
+    robot = type("Whole", (Spike,), {"name": "whole", "assemble": assemble})()
+    if use is str:
+        with pytest.warns(UserWarning, match="never reads the design variable length"):
+            robot.build()
+    else:
+        robot.build()

@@ -33,6 +33,7 @@ from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.materials import MATERIALS, lame_parameters
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
+from softgym_envs.quantities import unchecked
 from softgym_envs.testing import box_mesh
 from tests.verification.bodies import clamped_beam, halved, linear_response, solid, straight, traction
 from tests.verification.statics import COOK
@@ -97,15 +98,15 @@ def cook_problem(cells: int, element: str, nu: float) -> Problem:
     box, tetrahedra = box_mesh(cells=(cells, cells, 1))
     s, t, z = box.T
     nodes = np.column_stack([48.0 * s, 44.0 * s + t * (44.0 - 28.0 * s), thick * z])
-    model = MechanicalModel.from_mesh(
-        nodes,
-        tetrahedra,
-        fixed=np.column_stack([s == 0.0, s == 0.0, np.ones(len(s), dtype=bool)]),
-        element=element,
-        young_modulus=250.0,
-        poisson_ratio=nu,
-        max_size=100.0,
-    )
+    with unchecked("size", "modulus"):  # without dimensions
+        model = MechanicalModel.from_mesh(
+            nodes,
+            tetrahedra,
+            fixed=np.column_stack([s == 0.0, s == 0.0, np.ones(len(s), dtype=bool)]),
+            element=element,
+            young_modulus=250.0,
+            poisson_ratio=nu,
+        )
     loads = traction(model, lambda x: np.isclose(x[:, 0], 48.0), np.array([0.0, 100.0 * thick, 0.0]))
     corner = np.isclose(model.nodes[:, 0], 48.0) & np.isclose(model.nodes[:, 1], 60.0)
     return Problem(model, 250.0, nu, loads, lambda u: float(u[corner, 1].mean()))

@@ -13,7 +13,9 @@ import numpy as np
 
 from softgym_envs.backends.backend import PointForce, State
 from softgym_envs.envs.arrays import Array, namespace, pick_rows
+from softgym_envs.quantities import check_quantity
 from softgym_envs.robots.base import Robot
+from softgym_envs.robots.checks import plausible_force
 from softgym_envs.wording import decimal
 
 Kinematics = Callable[[Array], Array]
@@ -125,6 +127,18 @@ def check_length(value: float, name: str, robot: Robot) -> float:
             "did you mean metres?"
         )
     return value
+
+
+def check_force(value: float, name: str, robot: Robot) -> float:
+    """Return a force [N] with which a task acts on a robot, or asks of it.
+
+    Raises:
+        ValueError: for a value that is negative, not finite or far beyond what the robot's actuators can do.
+    """
+    check_quantity("force", value, name, high=plausible_force(robot), example=f"for robot '{robot.name}'")
+    if value < 0.0:
+        raise ValueError(f"{name} = {value} N must be non-negative and finite")
+    return float(value)
 
 
 #: Smallest reward whose logarithm is followed; below, gradients would be without bound.

@@ -8,7 +8,7 @@ from operator import mul
 import numpy as np
 
 from softgym_envs.envs.arrays import Array, namespace
-from softgym_envs.envs.tasks.base import Kinematics, Random, Task, check_length
+from softgym_envs.envs.tasks.base import Kinematics, Random, Task, check_force, check_length
 from softgym_envs.robots.base import Robot
 
 
@@ -42,6 +42,7 @@ class Carry(Task):
         check_length(distance, "distance", robot)
         if not (np.isfinite(push) and push >= 0.0):
             raise ValueError(f"push = {push} N must be non-negative and finite")
+        check_force(push, "push", robot)
         if push_steps < 1 or push_window < 1:
             raise ValueError(f"push_steps = {push_steps} and push_window = {push_window} must be at least 1")
         self.axes = np.array([1.0, 0.0, 0.0])

@@ -9,6 +9,7 @@ import numpy as np
 
 from softgym_envs.extensions.sensing.places import Places
 from softgym_envs.extensions.sensing.posterior import Gaussian
+from softgym_envs.quantities import check_quantity
 
 Cell = tuple[int, int]
 
@@ -144,6 +145,7 @@ class Touch:
 
     def __post_init__(self) -> None:
         _check_positive("expected_force", self.expected_force, "N")
+        check_quantity("force", self.expected_force, "expected_force")
 
     @property
     def points(self) -> np.ndarray:
@@ -216,6 +218,7 @@ class Payload:
 
     def __post_init__(self) -> None:
         _check_positive("expected_mass", self.expected_mass, "kg")
+        check_quantity("mass", self.expected_mass, "expected_mass")
 
     @property
     def points(self) -> np.ndarray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from softgym_envs.backends.backend import PointForce, State
+from softgym_envs.envs.tasks.base import check_force
 from softgym_envs.envs.tasks.reach import Reach
 from softgym_envs.extensions.sensing.loads import Cell, finger_grid
 from softgym_envs.robots.base import Robot
@@ -46,6 +47,7 @@ class SensedReach(Reach):
             raise ValueError(f"task '{self.name}' needs a robot with sensors, but robot '{robot.name}' has none")
         if not (np.isfinite(force) and force >= 0.0):
             raise ValueError(f"force = {force} N must be non-negative and finite")
+        check_force(force, "force", robot)
         if window < 1:
             raise ValueError(f"window = {window} must be at least 1")
         if history < 1:

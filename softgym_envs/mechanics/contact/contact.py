@@ -14,6 +14,7 @@ from softgym_envs.mechanics.contact.obstacles import MeshObstacle, Obstacle
 from softgym_envs.mechanics.contact.self_contact import SelfContact, SelfContactMemory
 from softgym_envs.mechanics.contact.surface import Mapping, Surface, surface_set
 from softgym_envs.mechanics.kinematics import Kinematics
+from softgym_envs.quantities import check_quantity
 
 
 @dataclass(frozen=True)
@@ -148,8 +149,14 @@ class ContactSettings:
             value = getattr(self, name)
             if value is not None and not (np.isfinite(value) and value > 0.0):
                 raise ValueError(f"{name} = {value} {unit} of contact must be positive and finite")
+        check_quantity("contact_distance", self.distance, "distance of contact")
+        if self.stiffness is not None:
+            check_quantity("contact_stiffness", self.stiffness, "stiffness of contact")
         if not (np.isfinite(self.self_friction) and self.self_friction >= 0.0):
             raise ValueError(f"self_friction = {self.self_friction} must be finite and not negative")
+        check_quantity("friction", self.self_friction, "self_friction")
+        if self.self_friction and not self.self_contact:
+            raise ValueError(f"self_friction = {self.self_friction} has no effect without self_contact=True")
 
 
 class Contact:

@@ -22,6 +22,10 @@ import numpy as np
 from softgym_envs.errors import unknown_name
 from softgym_envs.mechanics.compilation import njit
 from softgym_envs.mechanics.frames import frame_rows
+from softgym_envs.quantities import check_quantity
+
+_LENGTHS = ("point", "centre", "radius", "half_height", "polygon", "vertices")
+"""Fields of obstacles that are lengths [m]."""
 
 IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 Geometry = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -45,6 +49,7 @@ class RigidShape(ABC):
 
     def __post_init__(self) -> None:
         self._store("friction", self.friction, (), at_least=0.0)
+        check_quantity("friction", self.friction, f"{self._label}: friction")
         whole = isinstance(self.frame, int | np.integer) and not isinstance(self.frame, bool)
         if self.frame is not None and (not whole or self.frame < 0):
             raise ValueError(f"{self._label}: frame must be None or a row >= 0, got {self.frame!r}")
@@ -85,6 +90,8 @@ class RigidShape(ABC):
             raise ValueError(f"{self._label}: {field} must be at least {at_least:g}, got {value!r}")
         if above is not None and (array <= above).any():
             raise ValueError(f"{self._label}: {field} must be greater than {above:g}, got {value!r}")
+        if field in _LENGTHS:
+            check_quantity("length", array, f"{self._label}: {field}")
         if unit:
             length = np.linalg.norm(array)
             if length == 0.0:
@@ -102,6 +109,10 @@ class RigidShape(ABC):
             extent: half the size [m] of the part shown of an obstacle that is infinite.
         """
 
+    @abstractmethod
+    def distance_to(self, points: np.ndarray) -> float:
+        """Smallest distance [m] to points [m] (k, 3), or to the box around them; negative inside."""
+
     def as_dict(self) -> dict[str, Any]:
         """The record from which `obstacle_from` makes an equal obstacle; it can be stored as JSON."""
         return {"kind": self.kind, **{field.name: getattr(self, field.name) for field in fields(self)}}
@@ -109,6 +120,9 @@ class RigidShape(ABC):
 
 class Obstacle(RigidShape):
     """A rigid solid with a closed formula for the gap."""
+
+    def distance_to(self, points: np.ndarray) -> float:
+        return float(self.gap(points).min())
 
     @abstractmethod
     def gap(self, points: np.ndarray) -> np.ndarray:
@@ -487,6 +501,11 @@ class MeshObstacle(RigidShape):
         if (numbers % 1.0 != 0.0).any() or numbers.max() >= len(self.vertices):
             raise ValueError(f"{self._label}: triangles must be whole numbers below {len(self.vertices)}")
         object.__setattr__(self, "triangles", tuple(map(tuple, numbers.astype(int).tolist())))
+
+    def distance_to(self, points: np.ndarray) -> float:
+        own = np.asarray(self.vertices)
+        between = np.maximum(own.min(axis=0) - points.max(axis=0), points.min(axis=0) - own.max(axis=0))
+        return float(np.linalg.norm(between.clip(min=0.0)))
 
     def skin(self, extent: float = 0.1) -> tuple[np.ndarray, np.ndarray]:
         return np.asarray(self.vertices), np.asarray(self.triangles)

@@ -13,6 +13,7 @@ from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.elements.block import ElementBlock, StrainRates, lower_pairs
 from softgym_envs.mechanics.elements.damping import resist, strain_rates
 from softgym_envs.mechanics.materials import Material, lame_parameters, resolve_material
+from softgym_envs.quantities import check_quantity
 
 FACES = np.array([(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)])
 """Corners of the faces of a positively oriented tetrahedron, seen counter-clockwise from outside."""
@@ -221,6 +222,7 @@ def check_density(density: float) -> float:
     """
     if not (np.isfinite(density) and density >= 0.0):
         raise ValueError(f"density = {density} kg/m3 must be finite and not negative")
+    check_quantity("density", density, "density")
     return float(density)
 
 
@@ -267,7 +269,7 @@ class SolidBlock(ElementBlock):
         self.nodes_used = np.unique(connectivity)
         self.volume = float(weights.sum())
         self.mass = self.density * self.volume
-        self.set_elasticity(young_modulus, poisson_ratio)
+        self._set_elasticity(young_modulus, poisson_ratio)
         count = len(weights)
         self.stiffness = float(np.mean(self.mu)) * float(np.cbrt(self.volumes).mean())
         self._F = np.empty((count, 9))
@@ -283,7 +285,16 @@ class SolidBlock(ElementBlock):
         return self.connectivity[:, :4]
 
     def set_elasticity(self, young_modulus: float | np.ndarray, poisson_ratio: float | np.ndarray) -> None:
-        """Set Young's modulus [Pa] and Poisson's ratio, scalars or shape (m,)."""
+        """Set Young's modulus [Pa] and Poisson's ratio, scalars or shape (m,).
+
+        Raises:
+            ValueError: for a modulus that is probably in another unit, or a value that no material has.
+        """
+        values = np.ravel(np.asarray(young_modulus, dtype=float))
+        check_quantity("modulus", values[values > 0.0], "young_modulus")
+        self._set_elasticity(young_modulus, poisson_ratio)
+
+    def _set_elasticity(self, young_modulus: float | np.ndarray, poisson_ratio: float | np.ndarray) -> None:
         m = len(self.connectivity)
         young = np.broadcast_to(np.asarray(young_modulus, dtype=float), (m,))
         poisson = np.broadcast_to(np.asarray(poisson_ratio, dtype=float), (m,))

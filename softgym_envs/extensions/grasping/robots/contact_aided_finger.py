@@ -77,6 +77,7 @@ class ContactAidedFinger(MeshedRobot):
         "surrogate": "softgym_envs.extensions.grasping.backends.chain:ChainBackend",
         "hybrid": "softgym_envs.extensions.grasping.backends.hybrid_chain:HybridChainBackend",
     }
+    always_touches = True  # `evaluate_grasp` adds the object
     meshes = {
         "published": MeshTier(3.0e-3),
         "accurate": MeshTier(8.0e-3, "quadratic"),

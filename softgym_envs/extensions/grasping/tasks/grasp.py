@@ -6,7 +6,7 @@ import numpy as np
 
 from softgym_envs.backends.backend import State
 from softgym_envs.envs.arrays import Array
-from softgym_envs.envs.tasks.base import SHARES, Kinematics, Random, Task, tolerance
+from softgym_envs.envs.tasks.base import SHARES, Kinematics, Random, Task, check_force, check_length, tolerance
 from softgym_envs.robots.base import Robot
 
 
@@ -53,10 +53,10 @@ class Grasp(Task):
         for name, value, unit in (("tolerance", tolerance, ""), ("resistance", resistance, " m")):
             if not 0.0 < value < np.inf:
                 raise ValueError(f"{name} = {value}{unit} must be positive and finite")
-        self.forces = (float(low), float(high))
+        self.forces = (check_force(low, "forces", robot), check_force(high, "forces", robot))
         self.axes = np.array([1.0, 0.0, 0.0])
         self.success_distance = tolerance
-        self.resistance = resistance
+        self.resistance = check_length(resistance, "resistance", robot)
         self.goal_scale = 2.0 * self.forces[1]
         self.measured_scale = self.forces[1]
         self.error_scale = 0.1 * self.forces[1]
@@ -79,6 +79,7 @@ class Grasp(Task):
             raise ValueError(
                 f"goal must be a force (F, 0, 0) [N] with F > 0 and finite, got {np.asarray(goals).tolist()}"
             )
+        check_force(array[..., 0].max(), "goal", self.robot)
         return array
 
     def measure(self, state: State) -> np.ndarray:

@@ -1,0 +1,270 @@
+"""Checks of robots: what a class defines, the numbers of a new robot, and whether a built body follows from them."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from softgym_envs.designs import Design
+from softgym_envs.errors import unknown_name
+from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.mechanics.solids import check_modulus, check_size
+from softgym_envs.quantities import check_by_unit, check_quantity
+
+Robot = Any
+"""`softgym_envs.robots.base.Robot`, which imports this module."""
+
+PUBLISHED = "published"
+"""Name of the design box that every robot has: the bounds with which its class defines its design space."""
+
+CONTACT_DEFAULTS: dict[str, object] = {
+    "obstacles": (),
+    "self_contact": False,
+    "self_friction": 0.0,
+    "contact_distance": 5e-4,
+    "contact_stiffness": None,
+}
+"""Options of a robot that touches nothing. They are not part of its key."""
+
+STROKES = 2.0
+"""Largest stroke of an actuator, in sizes of the robot."""
+
+DIMENSIONS = 10.0
+"""Largest dimension of a design, in sizes of the robot; a radius of curvature may well be larger than the body."""
+
+CARRIED = 2000.0
+"""Largest mass that a robot is believed to carry, over the cube of its size [kg/m3]."""
+
+OPTIONS = {
+    "gravity": "gravity",
+    "density": "density",
+    "payload": "mass",
+    "object_mass": "mass",
+    "friction": "friction",
+    "stand_friction": "friction",
+    "self_friction": "friction",
+    "young_modulus": "modulus",
+    "stroke": "length",
+    "strokes": "length",
+    "mesh_size": "length",
+    "fillet": "length",
+    "guide_radius": "length",
+    "servo_range": "angle",
+    "max_pressure": "pressure",
+    "largest_volume": "volume",
+    "button_force": "force",
+    "contact_distance": "contact_distance",
+    "contact_stiffness": "contact_stiffness",
+}
+"""Quantity of each option of a robot that has a unit, by name; robots of other packages share these names."""
+
+_REQUIRED = ("name", "effectors", "size", "design_space", "actuators", "effector_rest", "effort_scale")
+
+
+def check_defined(holder: object, cls: type) -> None:
+    """Raise TypeError if an attribute that every robot needs is missing in a class, or in a new robot of it."""
+    missing = [name for name in _REQUIRED if not hasattr(holder, name)]
+    if missing:
+        raise TypeError(f"robot class '{cls.__name__}' does not define: {', '.join(missing)} (see Robot)")
+
+
+def check_robot(robot: Robot) -> None:
+    """Complete and check a new robot.
+
+    Raises:
+        TypeError: naming the attributes that the class does not define.
+        ValueError: for an unknown design box, arrays of a wrong shape, numbers that are probably in another unit, or an
+            option without effect.
+    """
+    check_defined(robot, type(robot))
+    boxes = {PUBLISHED: {}, **robot.design_boxes}
+    if robot.design_box not in boxes:
+        raise ValueError(f"robot '{robot.name}': {unknown_name('design_box', robot.design_box, boxes)}")
+    if bounds := boxes[robot.design_box]:
+        robot.design_space = robot.design_space.within(bounds)
+    if isinstance(robot.effectors, str):
+        raise TypeError(f"robot '{robot.name}': effectors must be a tuple of names, got {robot.effectors!r}")
+    if not hasattr(robot, "workspace_scale"):
+        robot.workspace_scale = 0.25 * robot.size
+    if robot.touches and robot.contact_stiffness is not None:
+        robot.stiffness_variable = None  # this stiffness does not scale with that of the body
+    for name, count in (("effector_rest", 3), ("effort_scale", len(robot.actuators))):
+        value = np.asarray(getattr(robot, name), dtype=float)
+        if value.shape != (count,):
+            raise ValueError(f"robot '{robot.name}': {name} must have shape ({count},), got {value.shape}")
+        if not np.isfinite(value).all():
+            raise ValueError(f"robot '{robot.name}': {name} must be finite, got {value.tolist()}")
+        setattr(robot, name, value)
+    # Rewards and observations are divided by these.
+    for name in ("size", "effort_scale", "sensor_scale", "goal_tolerance", "workspace_scale"):
+        value = np.asarray(getattr(robot, name), dtype=float)
+        if not (np.isfinite(value) & (value > 0.0)).all():
+            raise ValueError(f"robot '{robot.name}': {name} must be positive and finite, got {value.tolist()}")
+    _check_quantities(robot)
+    _check_touching(robot)
+
+
+def _check_quantities(robot: Robot) -> None:
+    """Raise ValueError for numbers that are probably in another unit."""
+    owner, size = f"robot '{robot.name}': ", robot.size
+    check_quantity("size", size, f"{owner}size")
+    for name in ("effector_rest", "goal_tolerance", "workspace_scale"):
+        check_quantity("length", getattr(robot, name), f"{owner}{name}", high=100.0 * size, example="near the robot")
+    strokes = {"m": STROKES * size, "m3": size**3}
+    for actuator in robot.actuators:
+        furthest, label = max(actuator.low, actuator.high, key=abs), f"{owner}stroke of actuator '{actuator.name}'"
+        if actuator.unit in strokes:
+            example = f"for a robot of size {size:g} m"
+            check_by_unit(actuator.unit, furthest, label, high=strokes[actuator.unit], example=example)
+    for variable in robot.design_space:
+        if variable.unit == "m":
+            furthest, label = max(variable.low, variable.high, key=abs), f"{owner}design variable '{variable.name}'"
+            check_quantity("length", furthest, label, high=DIMENSIONS * size, example=f"{DIMENSIONS:g} sizes")
+    narrower = {
+        "mass": (CARRIED * size**3, "what a robot of its size may carry"),
+        "contact_distance": (0.1 * size, "a tenth of the robot"),
+        "length": (STROKES * size, f"{STROKES:g} sizes of the robot"),
+        "force": (plausible_force(robot), "for its actuators"),
+    }
+    for name, value in robot.options.items():
+        if name in OPTIONS and _is_number(value) and not (name in CONTACT_DEFAULTS and value == CONTACT_DEFAULTS[name]):
+            high, example = narrower.get(OPTIONS[name], (None, ""))
+            check_quantity(OPTIONS[name], value, f"{owner}{name}", high=high, example=example)
+
+
+def plausible_force(robot: Robot) -> float:
+    """Return the largest plausible force on a robot [N]: ten times what its actuators can do together."""
+    per_unit = {"m": 1.0, "rad": 1.0 / robot.size, "m3": (0.3 * robot.size) ** 2}
+    if any(actuator.unit not in per_unit for actuator in robot.actuators):
+        return np.inf
+    return 10.0 * sum(
+        scale * per_unit[each.unit] for each, scale in zip(robot.actuators, robot.effort_scale, strict=True)
+    )
+
+
+def _is_number(value: object) -> bool:
+    if isinstance(value, list | tuple):
+        return bool(value) and all(map(_is_number, value))
+    return isinstance(value, int | float | np.number | np.ndarray) and not isinstance(value, bool)
+
+
+def _check_touching(robot: Robot) -> None:
+    """Raise ValueError for options of contact on a robot that touches nothing."""
+    if robot.self_friction and not robot.self_contact:
+        raise ValueError(
+            f"robot '{robot.name}': self_friction = {robot.self_friction} has no effect without self_contact=True"
+        )
+    if robot.may_touch:
+        return
+    for name in ("contact_distance", "contact_stiffness"):
+        given = robot._options.get(name)
+        if given is not None and given != CONTACT_DEFAULTS[name]:
+            raise ValueError(
+                f"robot '{robot.name}': {name} = {given} has no effect: it touches neither obstacles nor itself "
+                "(self_contact=True)"
+            )
+
+
+class WatchedDesign(Design):
+    """A design that notes which of its variables are read.
+
+    Attributes:
+        read: names of the variables read so far.
+    """
+
+    __slots__ = ("_array", "read")
+
+    def __init__(self, design: Design) -> None:
+        self.read: set[str] = set()
+        self.space, self._values, self._array = design.space, dict(design), design.array
+
+    @property
+    def array(self) -> np.ndarray:  # type: ignore[override]
+        """All values, which are read thereby."""
+        self.read.update(self.space.names)
+        return self._array
+
+    def __getitem__(self, name: str) -> float:
+        self.read.add(name)
+        return self._values[name]
+
+    def __hash__(self) -> int:  # as a key of a cache, which may know the answer to all that would be read
+        self.read.update(self.space.names)
+        return super().__hash__()
+
+    def __iter__(self) -> Iterator[str]:
+        return super().__iter__()
+
+    def __reduce__(self) -> tuple[type[Design], tuple[Any, dict[str, float]]]:
+        return Design, (self.space, self._values)
+
+
+def check_built(robot: Robot, model: Any, design: Mapping[str, float]) -> None:
+    """Check that an assembled model is what its robot says of it.
+
+    Args:
+        robot: the robot.
+        model: what its `assemble` returned.
+        design: the complete design of the model.
+
+    Raises:
+        ValueError: for another object than a model, actuators or effectors in another order or unit than declared, an
+            effector far from `Robot.effector_rest`, another gravity than the robot's, or a number that is probably in
+            another unit.
+    """
+    owner = f"robot '{robot.name}'"
+    if not isinstance(model, MechanicalModel):
+        raise ValueError(f"{owner}: assemble must return a MechanicalModel, got {model!r}")
+    declared = {"a": tuple(actuator.name for actuator in robot.actuators), "e": tuple(robot.effectors)}
+    for role, kind in (("a", "actuators"), ("e", "effectors")):
+        added = tuple(constraint.name for constraint in model.constraints[role])
+        if added != declared[role]:
+            wanted, got = (", ".join(names) or "none" for names in (declared[role], added))
+            raise ValueError(f"{owner}: assemble must add the {kind} {wanted} in this order, got {got}")
+    for actuator, constraint in zip(robot.actuators, model.constraints["a"], strict=True):
+        if constraint.unit[0] != actuator.unit:
+            raise ValueError(
+                f"{owner}: actuator '{actuator.name}' is declared in {actuator.unit}, but assemble adds one in "
+                f"{constraint.unit[0]}"
+            )
+    check_modulus([block.largest_young_modulus for block in model.blocks])
+    check_size(model.places, f"scale what {owner} assembles to metres")
+    if not np.array_equal(model.gravity, robot.gravity):
+        raise ValueError(
+            f"{owner}: option gravity = {tuple(robot.gravity)} m/s2 has no effect: assemble builds a model with "
+            f"{tuple(model.gravity.tolist())}; pass gravity=self.gravity to it"
+        )
+    _check_effector(robot, model, design)
+
+
+def _check_effector(robot: Robot, model: MechanicalModel, design: Mapping[str, float]) -> None:
+    """Raise ValueError for an effector that is not near `Robot.effector_rest`, from which goals are measured."""
+    if not model.constraints["e"]:
+        return
+    place = model.constraints["e"][0].value(model.nodes)
+    if place.shape != (3,):
+        return
+    baseline = design == robot.design_space.baseline
+    allowed = (0.1 if baseline else 1.0) * robot.size
+    away = float(np.linalg.norm(place - robot.effector_rest))
+    if away > allowed:
+        raise ValueError(
+            f"robot '{robot.name}': effector '{robot.effectors[0]}' of {'the baseline' if baseline else 'this'} body "
+            f"is at {np.round(place, 6).tolist()} m, {away:.3g} m away from effector_rest = "
+            f"{robot.effector_rest.tolist()} m; allowed: {allowed:g} m"
+        )
+
+
+def warn_unread(robot: Robot, design: WatchedDesign) -> None:
+    """Warn of design variables that `assemble` did not read. What chooses among parts may leave others unread."""
+    if any(variable.choices for variable in robot.design_space):
+        return
+    if unread := [name for name in robot.design_space.names if name not in design.read]:
+        warnings.warn(
+            f"robot '{robot.name}': assemble never reads the design variable{'s' if len(unread) > 1 else ''} "
+            f"{', '.join(unread)}: {'they change' if len(unread) > 1 else 'it changes'} nothing",
+            stacklevel=4,
+        )
