@@ -146,7 +146,6 @@ class Robot(ABC):
     non_mechanical_options: tuple[str, ...] = ("unilateral", "design_box")
     always_touches: bool = False
     _options: dict[str, object]
-    _built: bool = False
 
     def __init_subclass__(cls, **options: object) -> None:
         super().__init_subclass__(**options)
@@ -261,10 +260,8 @@ class Robot(ABC):
             watched = WatchedDesign(complete)
             model = self.assemble(watched)
             check_built(self, model, complete)
-            if not self._built:
-                warn_unread(self, watched)
-                self._built = True
-            self._add_contact(model, complete)
+            self._add_contact(model, watched)
+            warn_unread(self, watched)
             return model
         except SoftGymError:
             raise

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any
+from weakref import WeakSet
 
 import numpy as np
 
@@ -258,10 +259,18 @@ def _check_effector(robot: Robot, model: MechanicalModel, design: Mapping[str, f
         )
 
 
+_WATCHED: WeakSet[type] = WeakSet()
+"""Classes of robots whose reading of designs has been watched."""
+
+
 def warn_unread(robot: Robot, design: WatchedDesign) -> None:
-    """Warn of design variables that `assemble` did not read. What chooses among parts may leave others unread."""
-    if any(variable.choices for variable in robot.design_space):
+    """Warn of design variables that `assemble` did not read, once for each class.
+
+    What chooses among parts may leave others unread.
+    """
+    if type(robot) in _WATCHED or any(variable.choices for variable in robot.design_space):
         return
+    _WATCHED.add(type(robot))
     if unread := [name for name in robot.design_space.names if name not in design.read]:
         warnings.warn(
             f"robot '{robot.name}': assemble never reads the design variable{'s' if len(unread) > 1 else ''} "

@@ -46,7 +46,7 @@ class Deaf(Beam):
 
 
 class Elsewhere(Beam):
-    effector_rest = np.array([0.0, 0.005, 0.0])
+    effector_rest = np.array([0.055, 0.005, 0.01])
 
 
 class Feeble(Beam):
