@@ -109,7 +109,7 @@ MISTAKES = {
     "body in metres, scaled twice": (lambda _: body(1e-6), "*its size = 1e-07 m *; did you mean 0.1 m (metres, read*"),
     "clamp in millimetres": (
         lambda _: MechanicalModel.from_mesh(NODES, TETRAHEDRA, fixed=NODES[:, 0] < 1.0),
-        "all 20 nodes are fixed: nothing can move; *",
+        "*every node is clamped, so that nothing can move*",
     ),
     # Actuators and designs
     "actuator in degrees": (

@@ -241,7 +241,7 @@ MISTAKES = {
     ),
     "objective": (
         lambda f: config(f, StudyConfig, FINGER, "objective=mean_distanse"),
-        "config '*': *unknown objective 'mean_distanse'*mean_distance*",
+        "config '*': *unknown metric 'mean_distanse'*mean_distance*",
     ),
     "name in place of a list": (
         lambda f: config(f, StudyConfig, FINGER, "variables=length"),

@@ -198,10 +198,6 @@ class MechanicalModel:
             check=check,
         )
         check_modulus(part.options["young_modulus"])
-        if part.fixed.all():
-            raise ValueError(
-                f"all {len(part.fixed)} nodes are fixed: nothing can move; did you mean metres where you chose them?"
-            )
         block = part.kind(part.nodes, part.connectivity, **part.options)
         model = cls(part.nodes, [block], fixed=part.fixed, gravity=gravity, solver=solver)
         model._check_held()

@@ -176,7 +176,7 @@ LOOSE = {
 def test_a_body_that_is_not_held_is_refused(kind, element):
     (nodes, tetrahedra), fixed, message = LOOSE[kind]
     with pytest.raises(ValueError, match=message):
-        MechanicalModel.from_mesh(nodes, tetrahedra, fixed=fixed, element=element, max_size=10.0)
+        MechanicalModel.from_mesh(nodes, tetrahedra, fixed=fixed, element=element)
 
 
 def test_many_parts_at_nodes_only():
