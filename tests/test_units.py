@@ -16,7 +16,7 @@ from softgym_envs import DesignSpace, DesignVariable, make_robot, unchecked
 from softgym_envs.agents.config import EnvironmentConfig
 from softgym_envs.backends import make_backend
 from softgym_envs.config import load_config
-from softgym_envs.estimation.loads import Payload, Touch, finger_grid
+from softgym_envs.extensions.sensing.loads import Payload, Touch, finger_grid
 from softgym_envs.mechanics import MechanicalModel
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.contact.contact import ContactSettings

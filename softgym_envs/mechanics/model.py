@@ -50,8 +50,6 @@ from softgym_envs.quantities import check_quantity
 
 announce_compilation()
 
-FAR = 5.0
-"""Largest gap between a body and an obstacle, in lengths of the body; one that is farther away has another unit."""
 
 
 class MechanicalModel:
@@ -460,22 +458,8 @@ class MechanicalModel:
             settings = replace(settings, stiffness=stiffness)
         skins = [skin for skin in self.skins if skin.touches]
         self.contact = Contact(surface_of(self.nodes, self.blocks, skins, excluded), obstacles, settings)
-        self._check_near(self.contact)
+        self.contact.check_near(self.nodes)
         return self.contact
-
-    def _check_near(self, contact: Contact) -> None:
-        """Raise ValueError for obstacles far from the body, and for a distance of contact that is large beside it."""
-        points = contact.surface.points[0] @ self.nodes
-        if not len(points):
-            return
-        size = float(np.linalg.norm(np.ptp(points, axis=0)))
-        example = f"a tenth of the body, which is {size:.3g} m long"
-        check_quantity("contact_distance", contact.distance, "distance of contact", high=0.1 * size, example=example)
-        for obstacle in contact.obstacles:
-            if obstacle.frame is None:
-                label = f"gap between the body and obstacle '{obstacle.name or obstacle.kind}'"
-                gap = max(obstacle.distance_to(points), 0.0)
-                check_quantity("length", gap, label, high=FAR * size, example=f"{FAR:g} times the body's length")
 
     # -- loads ------------------------------------------------------------------------------------------------------
 

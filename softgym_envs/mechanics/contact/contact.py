@@ -60,6 +60,9 @@ class Contacts:
         return out
 
 
+FAR = 5.0
+"""Largest gap between a body and an obstacle, in lengths of the body; one that is farther away has another unit."""
+
 SMALLEST_GAP = 1e-6
 """Smallest gap between surfaces at rest, over the distance of contact: less cannot be told from touching."""
 
@@ -196,6 +199,24 @@ class Contact:
     def meshes(self) -> tuple[MeshObstacle, ...]:
         """The meshed obstacles."""
         return tuple(each for each in self.obstacles if isinstance(each, MeshObstacle))
+
+    def check_near(self, nodes: np.ndarray) -> None:
+        """Check the distances of contact and of obstacles against the size of the body, whose rest rows are (n, 3) [m].
+
+        Raises:
+            ValueError: for an obstacle far from the body, or a distance of contact that is large beside it.
+        """
+        points = self.surface.points[0] @ nodes
+        if not len(points):
+            return
+        size = float(np.linalg.norm(np.ptp(points, axis=0)))
+        example = f"a tenth of the body, which is {size:.3g} m long"
+        check_quantity("contact_distance", self.distance, "distance of contact", high=0.1 * size, example=example)
+        for obstacle in self.obstacles:
+            if obstacle.frame is None:
+                label = f"gap between the body and obstacle '{obstacle.name or obstacle.kind}'"
+                gap = max(obstacle.distance_to(points), 0.0)
+                check_quantity("length", gap, label, high=FAR * size, example=f"{FAR:g} times the body's length")
 
     def intersections(self, x: np.ndarray) -> str | None:
         """Return what crosses what at rows ``x`` (n, 3), or None."""
