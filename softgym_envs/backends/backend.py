@@ -53,9 +53,9 @@ class State:
             including inertia, is positive definite.
         uncertainty: bound on 95 % of the effector errors of a learned model [m]; 0 for FEM without
             learned superelements.
-        doubt: why the model is not trusted at the state, 0 if it is: a sum of numbers in
-            `softgym_envs.surrogate.domain.DOUBTS`. FEM is trusted unless a beam folds or a superelement is loaded
-            beyond what it has learned.
+        distrust: why the model is not trusted at the state, 0 if it is: a sum of numbers in
+            `softgym_envs.surrogate.domain.DISTRUST_REASONS`. FEM is trusted unless a beam folds or a
+            superelement is loaded beyond what it has learned.
         nodes: deformed nodes [m], shape (n, 3); None on the surrogate.
         contacts: where the body touches, with forces and gaps; None if it cannot touch anything.
         memory: what else the backend needs to continue from the state: the past of friction, or the motion of a
@@ -74,14 +74,14 @@ class State:
     row_effort: np.ndarray = field(default_factory=lambda: np.zeros(0))
     stable: bool = True
     uncertainty: float = 0.0
-    doubt: int = 0
+    distrust: int = 0
     contacts: Contacts | None = None
     memory: Any = None
 
     @property
     def trusted(self) -> bool:
         """Whether the model may be trusted at the state."""
-        return self.doubt == 0
+        return self.distrust == 0
 
     def __getstate__(self) -> dict[str, Any]:
         # A copy holds the condensed model itself, not the model that evaluates it.

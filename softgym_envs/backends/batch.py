@@ -24,7 +24,7 @@ class BatchState:
         slack: which actuators are slack, shape (B, n_a).
         converged: whether the state was found, shape (B,); rows without a state must not be used.
         uncertainty: uncertainty of the effector [m], shape (B,).
-        doubt: why the model is not trusted, 0 where it is (`softgym_envs.surrogate.domain.DOUBTS`), shape (B,).
+        distrust: why the model is not trusted, 0 where it is (`surrogate.domain.DISTRUST_REASONS`), shape (B,).
     """
 
     displacement: np.ndarray
@@ -33,12 +33,12 @@ class BatchState:
     slack: np.ndarray
     converged: np.ndarray
     uncertainty: np.ndarray
-    doubt: np.ndarray
+    distrust: np.ndarray
 
     @property
     def trusted(self) -> np.ndarray:
         """Whether the model may be trusted, shape (B,)."""
-        return self.doubt == 0
+        return self.distrust == 0
 
     def repeat(self, count: int) -> BatchState:
         """Return ``count`` copies of the state of one row."""

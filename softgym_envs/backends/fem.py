@@ -205,7 +205,7 @@ class FEMBackend(Backend):
         statics = Statics(model)
         linear, learned = statics.linearisation, any(block.learned for block in model.blocks)
         # In contact, only W needs the last factorisation of a step: it is made when W is read.
-        statics.exact_compliance = linear.contact is None or linear.rubs or learned
+        statics.exact_compliance = linear.contact is None or linear.has_friction or learned
         return statics
 
     def _checked_friction(self, friction: float) -> float:
@@ -396,17 +396,17 @@ class FEMBackend(Backend):
         if motion is not None and not still:
             assert self._dynamics is not None
             velocity = self._dynamics.effector_velocity().reshape(-1, 3)
-        doubt = 0 if all(block.knows(equilibrium.x) for block in self.model.blocks) else LOADED
+        distrust = 0 if all(block.knows(equilibrium.x) for block in self.model.blocks) else LOADED
         if any(block.is_folded(equilibrium.x) for block in self.model.blocks):
-            doubt |= FOLDED
+            distrust |= FOLDED
         uncertainty = 0.0
         learned = any(block.learned for block in self.model.blocks)
         if learned and not equilibrium.stable:
-            doubt |= SOFT
+            distrust |= SOFT
         if motion is None and learned:
             held = np.abs(equilibrium.effort[slices["a"]]) < self.largest_efforts * SATURATED
             uncertainty = float(np.linalg.norm(possible_errors(statics, held)[:3]))
-            doubt |= SPREAD if uncertainty > self.robot.goal_tolerance else 0
+            distrust |= SPREAD if uncertainty > self.robot.goal_tolerance else 0
         return State(
             command=np.array(command, dtype=float),
             displacement=equilibrium.delta[slices["a"]],
@@ -420,7 +420,7 @@ class FEMBackend(Backend):
             row_effort=equilibrium.effort,
             stable=equilibrium.stable,
             uncertainty=uncertainty,
-            doubt=doubt,
+            distrust=distrust,
             contacts=equilibrium.contacts,
             memory=equilibrium.memory,
         )

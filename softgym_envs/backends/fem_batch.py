@@ -45,7 +45,7 @@ class FEMBatch(BatchBackend):
         self.moving = first.moving
         count, size = len(designs), len(_rest(first)[1])
         self._slices = first.state.condensed.slices
-        self._play = RowLayout.of(first.model).play
+        self._slack_tolerance = RowLayout.of(first.model).slack_tolerance
         self._is_driven = np.arange(size) < len(robot.actuators)
         body = _beams(first).body
         self._present = BeamStates.of(body, size, count, factors=self.moving)
@@ -183,7 +183,7 @@ class FEMBatch(BatchBackend):
         a, e = self._slices["a"], self._slices["e"]
         displacement, effort = states.delta[:, a], states.effort[:, a]
         # The sign of the effort alone does not suffice: at rest it is round-off.
-        slack = self.robot.unilateral & (effort <= 0.0) & (displacement > self.command + self._play)
+        slack = self.robot.unilateral & (effort <= 0.0) & (displacement > self.command + self._slack_tolerance)
         count = len(effort)
         return BatchState(
             displacement.copy(),

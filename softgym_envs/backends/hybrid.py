@@ -204,7 +204,7 @@ class HybridBackend(Backend):
         elif self._fem.design != design:
             self._fem.reset(design)
             self.fem_calls += 1
-        self._play = RowLayout.of(self._fem.model).play
+        self._slack_tolerance = RowLayout.of(self._fem.model).slack_tolerance
         rest = self._fem.reset()
         self._known = [rest]
         return rest
@@ -272,7 +272,7 @@ class HybridBackend(Backend):
             displacement=displacement,
             effort=effort,
             effector=(free.e + W.ea @ effort).reshape(-1, 3),
-            slack=self._unilateral & (mode == "displacement") & (displacement > command + self._play),
+            slack=self._unilateral & (mode == "displacement") & (displacement > command + self._slack_tolerance),
             condensed=replace(condensed, effort=full),
         )
 

@@ -38,7 +38,12 @@ def solve_efforts(model: SurrogateModel, context: Context, effort: np.ndarray, s
             break
         displacement = displacement + np.clip(step, -limit, limit) * moving[:, None]
     return BatchState(
-        displacement, found, effector, np.zeros(found.shape, bool), ~moving, *model.doubt(context, displacement, spread)
+        displacement,
+        found,
+        effector,
+        np.zeros(found.shape, bool),
+        ~moving,
+        *model.distrust(context, displacement, spread),
     )
 
 
@@ -80,7 +85,7 @@ def solve_displacements(
     loose = unilateral & (displacement > target + (10.0 * TOLERANCE) * model.span)
     if loose.any():
         effort = np.where(loose, 0.0, np.where(unilateral, np.maximum(effort, 0.0), effort))
-    judged = model.doubt(context, displacement, spread, target)
+    judged = model.distrust(context, displacement, spread, target)
     return BatchState(displacement, effort, effector, loose, converged, *judged)
 
 
@@ -227,7 +232,7 @@ class SurrogateBody:
             velocity=np.zeros((self._effectors // 3, 3)),
             memory=None if motion is None else motion.at_rest(self._context, found.displacement, found.effort),
             uncertainty=float(found.uncertainty[0]),
-            doubt=int(found.doubt[0]),
+            distrust=int(found.distrust[0]),
         )
 
 

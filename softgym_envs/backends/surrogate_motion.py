@@ -175,8 +175,8 @@ class SurrogateMotion:
         n_a, model = self._actuators, self.model
         q, effector = state.place[:, :n_a].copy(), state.place[:, n_a : self._values].copy()
         slack = model.robot.unilateral & (q > command + 10.0 * TOLERANCE * model.span)
-        doubt = model.doubt(context, q, model.effector(context, q)[1], command)
-        return BatchState(q, state.effort.copy(), effector, slack, found, *doubt)
+        distrust = model.distrust(context, q, model.effector(context, q)[1], command)
+        return BatchState(q, state.effort.copy(), effector, slack, found, *distrust)
 
     def effector_velocity(self, state: MotionState) -> np.ndarray:
         """Return the velocities of the effectors [m/s], shape (B, n_e)."""

@@ -89,7 +89,7 @@ def rollout(
     """Run one episode and print its result."""
     import softgym_envs  # noqa: F401 - registers the IDs
     from softgym_envs.agents.evaluation import check_agent, make_agent
-    from softgym_envs.surrogate.domain import doubt_text
+    from softgym_envs.surrogate.domain import distrust_text
     from softgym_envs.viewer.paraview import ParaviewWriter
     from softgym_envs.viewer.recording import Filmed, Watcher, recorder_of, watch_rollout
 
@@ -116,15 +116,16 @@ def rollout(
         if video is not None:
             watchers.append(Filmed(env, frames))
         summary = watch_rollout(env, act, watchers, seed=seed)
-    total, step, doubts = summary["return"], summary["steps"], summary["doubts"]
+    total, step, distrust_codes = summary["return"], summary["steps"], summary["distrust_codes"]
     info = {"distance": summary["final_distance"], "is_success": summary["success"]}
     click.echo(f"{environment} on {config.backend}, agent {agent}: {counted(step, 'step')}, return {total:.2f}")
     scale = config.task_class.distance_scale
     click.echo(f"final {scale.name} {scale.text(info['distance'], 3)}, success {info['is_success']}")
-    if doubted := [doubt for doubt in doubts if doubt]:
-        reasons = doubt_text(functools.reduce(operator.or_, doubted))
-        verb = "is" if len(doubted) == 1 else "are"
-        click.echo(f"{len(doubted)} of {len(doubts)} states {verb} not trusted: {reasons}; compare with --backend fem")
+    if distrusted := [distrust for distrust in distrust_codes if distrust]:
+        reasons = distrust_text(functools.reduce(operator.or_, distrusted))
+        verb = "is" if len(distrusted) == 1 else "are"
+        count = f"{len(distrusted)} of {len(distrust_codes)} states"
+        click.echo(f"{count} {verb} not trusted: {reasons}; compare with --backend fem")
     if video is not None:
         write_video(video, frames, fps=env.metadata["render_fps"])
         click.echo(f"wrote {video}")

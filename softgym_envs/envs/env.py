@@ -453,7 +453,7 @@ def _mechanics(state: State) -> dict[str, Any]:
         "stable": state.stable,
         "uncertainty": state.uncertainty,
         "trusted": state.trusted,
-        "doubt": state.doubt,
+        "distrust": state.distrust,
     }
     if state.contacts is not None:
         contacts = state.contacts

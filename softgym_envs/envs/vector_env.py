@@ -420,7 +420,7 @@ class SoftRobotVectorEnv(VectorEnv):
             **{f"reward_{name}": term for name, term in terms.items()},
             "stable": self.backend.stable,
         }
-        for name in ("displacement", "effort", "uncertainty", "trusted", "doubt", "converged"):
+        for name in ("displacement", "effort", "uncertainty", "trusted", "distrust", "converged"):
             info[name] = getattr(state, name).copy()
         if self._plants is not None:
             zero = np.zeros(self.num_envs)

@@ -14,7 +14,7 @@ from softgym_envs.robots.base import Robot
 #: Why a state is not trusted. States hold the sum of these numbers, 0 for a trusted state.
 OUTSIDE, SPREAD, SOFT, LOADED, FOLDED, UNEXPLAINED, SELF_CONTACT = 1, 2, 4, 8, 16, 32, 64
 
-DOUBTS = {
+DISTRUST_REASONS = {
     OUTSIDE: "outside box",
     SPREAD: "spread",
     SOFT: "softening",
@@ -36,9 +36,9 @@ EDGE = 0.1
 """A variable counts as being at its bound within this part of half its range, linearly from 0 to 1."""
 
 
-def doubt_text(code: int) -> str:
-    """Return the reasons of a state's doubt in words, empty for a trusted state."""
-    return ", ".join(text for number, text in DOUBTS.items() if code & number) if code else ""
+def distrust_text(code: int) -> str:
+    """Return the reasons of a state's distrust in words, empty for a trusted state."""
+    return ", ".join(text for number, text in DISTRUST_REASONS.items() if code & number) if code else ""
 
 
 @dataclass(frozen=True)
@@ -101,9 +101,9 @@ class Calibration:
 @njit(cache=True, error_model="numpy")
 def assess_trust(
     displacement, command, spread, slot, low, high, command_low, command_high, pulls,
-    factor, corner, known, scale, floor, power, limit, uncertainty, doubt,
+    factor, corner, known, scale, floor, power, limit, uncertainty, distrust,
 ):  # fmt: skip
-    """Fill ``uncertainty`` and ``doubt`` (B,) of states by displacements, commands (B, n) and spread (B,).
+    """Fill ``uncertainty`` and ``distrust`` (B,) of states by displacements, commands (B, n) and spread (B,).
 
     ``scale`` multiplies the uncertainty, of all rows (1,) or of each (B,).
     """
@@ -130,7 +130,7 @@ def assess_trust(
         uncertainty[row] = value
         if not value <= limit and not np.isinf(sigma):
             code |= SPREAD
-        doubt[row] = code
+        distrust[row] = code
 
 
 @dataclass(frozen=True)

@@ -273,11 +273,11 @@ class SurrogateModel(ABC):
     def trust(
         self, context: Context, displacement: np.ndarray, spread: np.ndarray, command: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Judge predictions: return their uncertainty [m] and whether they are trusted, both (B,); see `doubt`."""
-        uncertainty, doubt = self.doubt(context, displacement, spread, command)
-        return uncertainty, doubt == 0
+        """Judge predictions: return their uncertainty [m] and whether they are trusted, both (B,); see `distrust`."""
+        uncertainty, distrust = self.distrust(context, displacement, spread, command)
+        return uncertainty, distrust == 0
 
-    def doubt(
+    def distrust(
         self, context: Context, displacement: np.ndarray, spread: np.ndarray, command: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Judge predictions at displacements (B, n_a) by their spread (B,).
@@ -291,8 +291,8 @@ class SurrogateModel(ABC):
         Returns:
             The uncertainty of the effector [m] (B,), a bound on 95 % of the errors (see
             `softgym_envs.surrogate.domain.Calibration`); and why predictions are not trusted (B,), sums of the numbers
-            in `softgym_envs.surrogate.domain.DOUBTS`, 0 for a trusted one. A model without an ensemble is judged by its
-            domain alone.
+            in `softgym_envs.surrogate.domain.DISTRUST_REASONS`, 0 for a trusted one. A model without an
+            ensemble is judged by its domain alone.
         """
         domain, calibration = self.domain, self.domain.calibration
         scale, floor, power = domain.inflation, calibration.floor, calibration.power
@@ -305,15 +305,15 @@ class SurrogateModel(ABC):
             if calibration.buckling != 1.0 and (soft.any() or calibration.soft < domain.growth):
                 near = exceeds_softening(calibration.soft, K, *bodies)
                 scales = np.where(near, scale * calibration.buckling, scale)
-        uncertainty, doubt = np.empty(len(displacement)), np.empty(len(displacement), dtype=np.int8)
+        uncertainty, distrust = np.empty(len(displacement)), np.empty(len(displacement), dtype=np.int8)
         assess_trust(
             displacement, displacement if command is None else command, spread, context.slot, domain.low, domain.high,
             domain.command_low, domain.command_high, domain.unilateral, arrays["factor"], arrays["corner"],
-            arrays["known"], scales, floor, power, domain.limit, uncertainty, doubt,
+            arrays["known"], scales, floor, power, domain.limit, uncertainty, distrust,
         )  # fmt: skip
         if soft is not None:
-            doubt[soft] |= SOFT
-        return uncertainty, doubt
+            distrust[soft] |= SOFT
+        return uncertainty, distrust
 
     def softening_ratio(self, context: Context, displacement: np.ndarray) -> np.ndarray:
         """Return how many times softer the actuators are at displacements (B, n_a) than at zero, shape (B,).

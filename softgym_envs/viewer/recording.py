@@ -232,7 +232,7 @@ def record_rollout(
 
     Returns:
         ``return`` (sum of rewards), ``final_distance`` (as `Task.distance` returns it: [m] for positions), ``success``
-        at the last step, ``steps``, and ``doubts``, the ``info["doubt"]`` of each state.
+        at the last step, ``steps``, and ``distrust_codes``, the ``info["distrust"]`` of each state.
 
     Raises:
         ValueError: if the environment is not a `SoftRobotEnv`, or has no time limit while ``steps`` is None.
@@ -319,16 +319,16 @@ def watch_rollout(
             watcher.log(step, body.design, body.state, goal, path=path, reward=reward, distance=distance)
 
     log(0, None)
-    total, step, over, doubts = 0.0, 0, False, [int(info["doubt"])]
+    total, step, over, distrust_codes = 0.0, 0, False, [int(info["distrust"])]
     while step < steps and not over:
         observation, reward, terminated, truncated, info = env.step(agent(observation, body))
         step, total, over = step + 1, total + float(reward), terminated or truncated
-        doubts.append(int(info["doubt"]))
+        distrust_codes.append(int(info["distrust"]))
         log(step, float(reward))
     return {
         "return": total,
         "final_distance": float(info["distance"]),
         "success": bool(info["is_success"]),
         "steps": step,
-        "doubts": doubts,
+        "distrust_codes": distrust_codes,
     }

@@ -87,11 +87,11 @@ def test_untrusted_states_are_counted():
     env = environment.make()
     act = make_agent("tetrapod_carry_empty")
     observation, _ = env.reset(seed=0)
-    doubted = []
+    distrusted = []
     for _ in range(100):
         observation, _, _, _, info = env.step(act(observation, env.unwrapped))
-        doubted.append(not info["trusted"])
-    assert folding.untrusted[0] == pytest.approx(np.mean(doubted), abs=0.02)
+        distrusted.append(not info["trusted"])
+    assert folding.untrusted[0] == pytest.approx(np.mean(distrusted), abs=0.02)
     assert 0.0 <= evaluate("random", environment, goals).untrusted[0] <= 1.0
 
 

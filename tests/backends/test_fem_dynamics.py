@@ -150,7 +150,7 @@ def test_a_probe_starts_from_the_present_shape():
         command = share * 0.5 * np.pi * np.array([1.0, 1.0, -1.0, 1.0])
         backend.step(command)
     first, again = (backend.probe(command) for _ in range(2))
-    assert first.doubt == again.doubt == FOLDED
+    assert first.distrust == again.distrust == FOLDED
     np.testing.assert_allclose(first.effector, again.effector, atol=1e-9)
 
 

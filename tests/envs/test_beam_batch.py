@@ -129,7 +129,7 @@ def test_rows_with_folded_legs_are_not_trusted():
     for _ in range(12):
         info = env.step(right)[4]
     np.testing.assert_array_equal(info["trusted"], [False, True])
-    np.testing.assert_array_equal(info["doubt"], [FOLDED, 0])
+    np.testing.assert_array_equal(info["distrust"], [FOLDED, 0])
 
 
 def test_tasks_that_push_step_in_processes():

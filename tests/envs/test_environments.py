@@ -164,8 +164,8 @@ def check_info(info):
     """TorchRL reads the dtype of every value; Gymnasium batches booleans only if they are arrays."""
     flags = ("is_success", "lost", "stable", "trusted", "converged")
     assert {name for name, value in info.items() if value.dtype == bool} == set(flags)
-    assert info["doubt"].dtype == np.int64
-    whole = ("doubt", "plant_delay")
+    assert info["distrust"].dtype == np.int64
+    whole = ("distrust", "plant_delay")
     assert all(value.dtype == float for name, value in info.items() if name not in (*flags, *whole))
 
 

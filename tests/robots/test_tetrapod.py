@@ -14,7 +14,7 @@ from softgym_envs.errors import ConvergenceError, DesignError
 from softgym_envs.mechanics.elements.beams import Beam
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.tetrapod import CENTRE_MASS, MESHES
-from softgym_envs.surrogate.domain import doubt_text
+from softgym_envs.surrogate.domain import distrust_text
 from tests.verification import robot_dynamics as cases
 
 
@@ -78,7 +78,7 @@ def test_a_leg_that_folds_is_not_trusted():
             state = backend.step(k / 12 * 0.5 * np.pi * np.array([1.0, 1.0, -1.0, 1.0]))
         ends[mesh] = state.effector[0]
         assert state.trusted == (mesh != "published")
-        assert doubt_text(state.doubt) == ("folded beam" if mesh == "published" else "")
+        assert distrust_text(state.distrust) == ("folded beam" if mesh == "published" else "")
     assert ends["published"][0] == pytest.approx(0.088, abs=1e-3)
     assert ends["accurate"][0] == pytest.approx(0.063, abs=1e-3)
     np.testing.assert_allclose(ends["accurate"], ends["reference"], atol=4e-4)

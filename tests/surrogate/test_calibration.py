@@ -30,7 +30,7 @@ from softgym_envs.surrogate.calibration import (
 )
 from softgym_envs.surrogate.data import strata
 from softgym_envs.surrogate.data.strata import StratifiedStates, draw_commands, strata_of
-from softgym_envs.surrogate.domain import OUTSIDE, SOFT, SPREAD, Calibration, Domain, doubt_text
+from softgym_envs.surrogate.domain import OUTSIDE, SOFT, SPREAD, Calibration, Domain, distrust_text
 from softgym_envs.surrogate.features import learned_variables
 from softgym_envs.surrogate.pretrained import pretrained_folder, pretrained_model, shipped_robots
 from softgym_envs.surrogate.weight_files import load_model, save_model
@@ -111,7 +111,7 @@ def test_poisson_ratios_are_trusted_up_to_those_of_the_training():
     assert domain.design_low[k] == pytest.approx(low - 0.01 * (high - low), rel=1e-8)  # here the linear one is narrower
     designs = np.array([space.complete({"poisson_ratio": nu}).array for nu in (high, 0.4988, 0.499)])
     context, still = model.context(designs), np.zeros((3, model.count))
-    assert (model.doubt(context, still, np.zeros(3), still)[1] & OUTSIDE).tolist() == [0, OUTSIDE, OUTSIDE]
+    assert (model.distrust(context, still, np.zeros(3), still)[1] & OUTSIDE).tolist() == [0, OUTSIDE, OUTSIDE]
     # A ratio that was not learned stays trusted, in spite of round-off.
     card = {"domain": {"design": {"poisson_ratio": [0.3, 0.3]}}}
     fixed = Domain.of_card(card, model.robot)
@@ -146,24 +146,24 @@ def test_uncertainty_follows_the_formula():
     displacement[3, 1] = 0.004  # slack
     spread = np.array([1e-5, 0.0, 3e-5, 2e-5, 2e-5, 1e-6])
     context = model.context(designs)
-    uncertainty, doubt = model.doubt(context, displacement, spread, command)
+    uncertainty, distrust = model.distrust(context, displacement, spread, command)
     sigma = 1e-5 * (np.hypot(spread, 1e-5) / 1e-5) ** 0.75
     np.testing.assert_allclose(uncertainty, np.array([2.0, 3.0, 4.0, 6.0, 4.0, 3.0]) * sigma, rtol=2e-3)
-    assert doubt.tolist() == [0, 0, 0, SPREAD if uncertainty[3] > 1e-4 else 0, 0, OUTSIDE]
-    assert (uncertainty[3] > 1e-4) == bool(doubt[3] & SPREAD)
+    assert distrust.tolist() == [0, 0, 0, SPREAD if uncertainty[3] > 1e-4 else 0, 0, OUTSIDE]
+    assert (uncertainty[3] > 1e-4) == bool(distrust[3] & SPREAD)
     # Without commands the reached displacements count, and no cable is slack.
-    plain = model.doubt(context, displacement, spread)[0]
+    plain = model.distrust(context, displacement, spread)[0]
     assert plain[3] == pytest.approx(4.0 * sigma[3], rel=2e-3) and (plain[[0, 1, 2]] == uncertainty[[0, 1, 2]]).all()
     outside = displacement.copy()
     outside[0, 0] = 0.03
-    assert model.doubt(context, outside, spread, command)[1][0] == OUTSIDE
-    assert model.doubt(context, displacement, np.full(6, np.inf), command)[1].tolist() == [0, 0, 0, 0, 0, OUTSIDE]
+    assert model.distrust(context, outside, spread, command)[1][0] == OUTSIDE
+    assert model.distrust(context, displacement, np.full(6, np.inf), command)[1].tolist() == [0, 0, 0, 0, 0, OUTSIDE]
 
 
 def test_doubt_in_words():
-    assert doubt_text(0) == ""
-    assert doubt_text(OUTSIDE | SOFT) == "outside box, softening"
-    assert doubt_text(SPREAD) == "spread"
+    assert distrust_text(0) == ""
+    assert distrust_text(OUTSIDE | SOFT) == "outside box, softening"
+    assert distrust_text(SPREAD) == "spread"
 
 
 @pytest.mark.parametrize("name, options", shipped_robots().values(), ids=shipped_robots())

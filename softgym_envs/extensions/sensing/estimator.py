@@ -68,7 +68,7 @@ class Estimate:
         converged: whether Gauss-Newton converged, within the accuracy of its last equilibrium.
         equilibria: how many were computed for this reading.
         near: the equilibrium near which the estimate lies, with its condensed model.
-        doubt: why the estimate is not trusted, 0 if it is: a number in `softgym_envs.surrogate.domain.DOUBTS`.
+        distrust: why the estimate is not trusted, 0 if it is: a number in `domain.DISTRUST_REASONS`.
     """
 
     displacement: np.ndarray
@@ -81,12 +81,12 @@ class Estimate:
     converged: bool
     equilibria: int
     near: Linearised
-    doubt: int
+    distrust: int
 
     @property
     def trusted(self) -> bool:
         """Whether the model explains the readings."""
-        return self.doubt == 0
+        return self.distrust == 0
 
     @property
     def condensed(self) -> CondensedModel:
@@ -424,7 +424,7 @@ class Estimator:
             converged=converged,
             equilibria=self._solved,
             near=found.near,
-            doubt=UNEXPLAINED if unexplained else 0,
+            distrust=UNEXPLAINED if unexplained else 0,
         )
         mixture = evidence.mixture
         if mixture is not None:

@@ -59,7 +59,7 @@ class LearnedEstimate:
         misfit: sum of the squared residuals at the most probable place, in standard deviations of the readings.
         condensed: model of actuators, effectors and sensors at the most probable place.
         slack: which actuators hang slack there, shape (n_a,).
-        doubt: why the estimate is not trusted, 0 if it is: a sum of numbers in `softgym_envs.surrogate.domain.DOUBTS`.
+        distrust: why the estimate is not trusted, 0 if it is: a sum of numbers in `domain.DISTRUST_REASONS`.
     """
 
     displacement: np.ndarray
@@ -70,12 +70,12 @@ class LearnedEstimate:
     misfit: float
     condensed: CondensedModel
     slack: np.ndarray
-    doubt: int
+    distrust: int
 
     @property
     def trusted(self) -> bool:
         """Whether the model may be trusted here and explains the readings."""
-        return self.doubt == 0
+        return self.distrust == 0
 
 
 @dataclass(frozen=True)
@@ -265,30 +265,30 @@ class LearnedEstimator:
                 found, response, at = other
                 expected, best = _expected(found, response, at)
                 misfit = float((((measured - expected) / spread) ** 2).sum())
-        doubt = self._doubt(command, found, response, best)
+        distrust = self._distrust(command, found, response, best)
         one = np.hypot(self.noise.volume, deviation[self._own :])
         if not explains((volumes + bias[self._own :] - expected) / one):
-            doubt |= UNEXPLAINED
+            distrust |= UNEXPLAINED
         elif self._has_learned(command):
             after = replace(known, after=found, count=count, mean=mean, at=self._limited(found.means), tried=tried)
             self._known = after
         tips = response.effectors - bias[: self._own] - np.einsum("qon,qn->qo", response.effector_slopes, at)
         moments = found.moments(tips, response.effector_slopes)
-        return self._estimate(command, moments, misfit, response, best, deviation[: self._own], doubt)
+        return self._estimate(command, moments, misfit, response, best, deviation[: self._own], distrust)
 
     def _has_learned(self, command: np.ndarray) -> bool:
         """Return whether a command (n_a,) lies in the box of the training states."""
         return bool(((self.model.domain.low <= command) & (command <= self.model.domain.high)).all())
 
-    def _doubt(self, command: np.ndarray, found: Mixture, response: _Responses, best: int) -> int:
+    def _distrust(self, command: np.ndarray, found: Mixture, response: _Responses, best: int) -> int:
         """Return why the model is not trusted at the most probable place, 0 if it is."""
         row = slice(best, best + 1)
         context, displacement = response.context.rows(np.array([best])), response.displacement[row]
         spread = self.model.effector(context, displacement)[1]
-        doubt = int(self.model.doubt(context, displacement, spread, command[None])[1][0])
+        distrust = int(self.model.distrust(context, displacement, spread, command[None])[1][0])
         force = found.means[best, -1] if self.load is not None else 0.0
         inside = self._has_learned(command) and force <= self.largest_force
-        return doubt if inside else doubt | OUTSIDE
+        return distrust if inside else distrust | OUTSIDE
 
     def _share(self, command: np.ndarray) -> float:
         """Return how far the actuators are commanded, as a mean share of their ranges."""
@@ -326,7 +326,7 @@ class LearnedEstimator:
         response: _Responses,
         best: int,
         deviation: np.ndarray,
-        doubt: int,
+        distrust: int,
     ) -> LearnedEstimate:
         loaded = slice(0, None if self.load is not None else 0)
         every, size = response.condensed, self.model.size
@@ -344,7 +344,7 @@ class LearnedEstimator:
             misfit=misfit,
             condensed=CondensedModel(W, delta - W @ effort, effort, roles, tuple(every.rows[k] for k in kept)),
             slack=response.slack[best],
-            doubt=doubt,
+            distrust=distrust,
         )
 
     def _limited(self, parameters: np.ndarray) -> np.ndarray:

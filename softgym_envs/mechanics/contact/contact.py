@@ -309,7 +309,7 @@ class ContactState:
     # -- memory -----------------------------------------------------------------------------------------------------
 
     @property
-    def rubs(self) -> bool:
+    def has_friction(self) -> bool:
         """Whether there is friction, so that forces depend on the path."""
         return any(each.friction > 0.0 for each in self.contact.obstacles) or self.contact.self_friction > 0.0
 

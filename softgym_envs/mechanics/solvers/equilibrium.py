@@ -86,13 +86,14 @@ class RowLayout:
         roles: role letters and sizes without bonds.
         labels: names and units of these rows.
         bonds: number of bond rows.
-        play: by how much more than commanded a taut actuator may be displaced, by round-off [m, m3, ...], shape (n_a,).
+        slack_tolerance: by how much more than commanded a taut actuator may be displaced, by round-off [m, m3, ...],
+            shape (n_a,).
     """
 
     roles: Roles
     labels: tuple[Row, ...]
     bonds: int
-    play: np.ndarray
+    slack_tolerance: np.ndarray
 
     @classmethod
     def of(cls, model: MechanicalModel) -> RowLayout:
@@ -104,7 +105,7 @@ class RowLayout:
             roles=tuple(role for role in model.roles if role[0] != "b"),
             labels=tuple(row for group in groups for c in group for row in c.rows()),
             bonds=dict(model.roles).get("b", 0),
-            play=ROUND_OFF * np.concatenate([np.zeros(0), *slopes]).clip(max=1.0),
+            slack_tolerance=ROUND_OFF * np.concatenate([np.zeros(0), *slopes]).clip(max=1.0),
         )
 
     def slack(
@@ -123,7 +124,7 @@ class RowLayout:
         rows = driven[driven < len(unilateral)]
         rows = rows[unilateral[rows]] if len(rows) else rows
         # The sign of the effort alone does not suffice: at rest it is round-off.
-        slack[rows] = (effort[rows] <= 0.0) & (delta[rows] > target[rows] + self.play[rows])
+        slack[rows] = (effort[rows] <= 0.0) & (delta[rows] > target[rows] + self.slack_tolerance[rows])
         return slack
 
     def equilibrium(

@@ -25,7 +25,7 @@ def exact_at(statics: Statics, found: Equilibrium) -> Equilibrium:
     if found.conditions is None:
         return found
     model, linear, (loads, elasticity_version) = statics.model, statics.linearisation, found.conditions
-    if linear.rubs:
+    if linear.has_friction:
         raise ValueError("a body with friction needs a solver with exact_compliance=True")
     contact = None if linear.contact is None else linear.contact.contact
     same = model.assembly is linear.assembly and model.contact is contact

@@ -66,9 +66,9 @@ class Linearisation:
         return self._slips > 0
 
     @property
-    def rubs(self) -> bool:
+    def has_friction(self) -> bool:
         """Whether points or cables can slide with friction, which starts anew from each equilibrium."""
-        return self.cable_friction is not None or (self.contact is not None and self.contact.rubs)
+        return self.cable_friction is not None or (self.contact is not None and self.contact.has_friction)
 
     @property
     def memory(self) -> ContactMemory | CableMemory | None:

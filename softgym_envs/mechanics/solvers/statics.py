@@ -404,7 +404,7 @@ class Statics:
         """Whether the current state is the commanded equilibrium, from its correction; see `_correction`."""
         linear = self.linearisation
         # Friction starts anew from the last equilibrium, so it has to be solved for once more.
-        if not linear.exact or linear.rubs or np.delete(step_effort, driven).any():
+        if not linear.exact or linear.has_friction or np.delete(step_effort, driven).any():
             return False
         if self._norm(step_q) > self.tolerance or self._norm(linear.response(step_effort)) > self.tolerance:
             return False
@@ -502,7 +502,7 @@ class Statics:
             done, carried = level, linear.loads
             size *= 1.5
             found = self._state(target, driven, iterations, increments)
-            if linear.rubs:
+            if linear.has_friction:
                 self._accept()
                 found = replace(found, memory=self.memory)
         return found

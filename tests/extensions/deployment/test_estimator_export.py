@@ -45,7 +45,7 @@ class Result(ctypes.Structure):
         ("effector_covariance", ctypes.c_double * 9),
         ("misfit", ctypes.c_double),
         ("slack", ctypes.c_int * 1),
-        ("doubt", ctypes.c_int),
+        ("distrust", ctypes.c_int),
     ]
 
     def array(self, name):
@@ -142,7 +142,7 @@ def test_estimates_are_those_of_python(exported, real):
         expected = reference.update(Readings(command, volumes))
         status, found = machine.update(command, volumes)
         assert status == 0 and bool(found.slack[0]) == bool(expected.slack[0])
-        assert found.doubt == expected.doubt & ~SPREAD  # the header has no ensemble
+        assert found.distrust == expected.distrust & ~SPREAD  # the header has no ensemble
         scale = np.linalg.norm(deviations(expected.effector_covariance))
         row = [
             np.abs(found.array("effector") - expected.effector).max() / scale,
@@ -185,9 +185,9 @@ def test_wrong_readings_change_nothing(exported):
     ):
         found, result = machine.update(command, measured)
         assert found == status and not result.array("effector_covariance").any()
-    for command, measured, doubt in (([0.0152], volumes, OUTSIDE), ([0.005], 0.9 * volumes, UNEXPLAINED)):
+    for command, measured, distrust in (([0.0152], volumes, OUTSIDE), ([0.005], 0.9 * volumes, UNEXPLAINED)):
         status, result = machine.update(command, measured)
-        assert status == 0 and result.doubt & doubt and result.array("effector_covariance").any()
+        assert status == 0 and result.distrust & distrust and result.array("effector_covariance").any()
     assert machine.struct.raw == before
     assert machine.update([0.005], volumes)[0] == 0 and machine.struct.raw != before
 

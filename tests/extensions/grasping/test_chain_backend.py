@@ -134,7 +134,7 @@ def test_folds_are_not_trusted(robot):
     backend = ChainBackend(robot, thin)
     trusted = [backend.step(np.radians([2.0 * k])).trusted for k in range(1, 21)]
     assert all(trusted[:14])
-    assert not trusted[-1] and backend.state.doubt == SELF_CONTACT
+    assert not trusted[-1] and backend.state.distrust == SELF_CONTACT
     assert backend.state.contacts.smallest_gap < robot.contact_distance
     without = ChainBackend(make_robot("grasping_finger", self_contact=False), thin)
     assert closed(without, 40.0, 20).trusted
@@ -191,7 +191,7 @@ def test_unknown_bodies_are_given_to_finite_elements(robot, monkeypatch):
     Recorder.steps = 0
     backend = HybridChainBackend(robot, {"e3": 0.002})
     backend.step(np.radians([2.0]))
-    assert backend.learned.state.doubt & OUTSIDE
+    assert backend.learned.state.distrust & OUTSIDE
     assert Recorder.steps == 1
     assert backend.fem_calls == 2
 

@@ -193,7 +193,7 @@ def test_hybrid_hands_follow_with_finite_elements(monkeypatch):
     before = closed(backend)
     np.testing.assert_array_equal(before.effector, closed(alone).effector)
     assert before.trusted and not asked
-    monkeypatch.setattr(ChainHand, "doubt", property(lambda self: OUTSIDE))
+    monkeypatch.setattr(ChainHand, "distrust", property(lambda self: OUTSIDE))
     found, expected = lifted(backend), lifted(alone)
     assert len(asked) == 14  # nine to close, five to lift
     np.testing.assert_array_equal(found.contacts.total, expected.contacts.total)

@@ -10,7 +10,7 @@ from softgym_envs.errors import DesignError, InfeasibleDesign
 from softgym_envs.extensions.deployment.cad import export_body
 from softgym_envs.extensions.modules.modular_arm import BODIES, CELLS
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.surrogate.domain import doubt_text
+from softgym_envs.surrogate.domain import distrust_text
 from tests.verification.modular_arm import ExactArm
 
 
@@ -98,7 +98,7 @@ def test_an_arm_that_buckles_is_told_and_not_trusted():
             assert (np.linalg.eigvalsh(W.aa)[0] > 0.0) == definite
             assert np.linalg.eigvalsh(W.ee - W.ea @ np.linalg.solve(W.aa, W.ae))[0] > 0.0
         assert state.trusted == (body == "solid")
-        assert ("softening" in doubt_text(state.doubt)) == (body == "superelements")
+        assert ("softening" in distrust_text(state.distrust)) == (body == "superelements")
 
 
 def test_the_compliance_of_any_arm_is_positive_definite_where_it_is_stable():
@@ -204,8 +204,8 @@ def test_loads_that_were_not_learned_are_told():
         _, info = env.reset(seed=0)
         assert info["trusted"]
         state = env.unwrapped.backend.step(np.array(command))
-        assert state.trusted == trusted and (state.doubt == 0) == trusted
-    assert "loads" in doubt_text(state.doubt)
+        assert state.trusted == trusted and (state.distrust == 0) == trusted
+    assert "loads" in distrust_text(state.distrust)
     solid = FEMBackend(make_robot("modular_arm", body="solid", **bent))
     assert solid.step(np.array([0.0, 0.002])).trusted
 

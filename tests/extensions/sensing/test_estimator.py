@@ -174,7 +174,7 @@ def test_unexplained_readings_are_not_trusted_and_not_remembered():
     right = first.reading(command, first.linearise(command, TOUCH).state.condensed.delta.s)
     assert first.update(right).trusted and other.update(right).trusted
     found = first.update(replace(right, volumes=0.9 * right.volumes))
-    assert found.converged and found.doubt == UNEXPLAINED and not found.trusted
+    assert found.converged and found.distrust == UNEXPLAINED and not found.trusted
     after, expected = first.update(right), other.update(right)
     np.testing.assert_allclose(after.load, expected.load, rtol=0, atol=1e-6)
     np.testing.assert_allclose(after.load_covariance, expected.load_covariance, rtol=1e-6, atol=1e-12)

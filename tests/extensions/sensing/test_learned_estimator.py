@@ -164,7 +164,7 @@ def same(found, expected):
 def test_a_likely_reading_is_trusted(robot):
     estimator = touched(robot)
     found = estimator.update(plant_reading(estimator))
-    assert found.trusted and found.doubt == 0
+    assert found.trusted and found.distrust == 0
 
 
 @pytest.mark.parametrize(
@@ -187,20 +187,20 @@ def test_what_the_model_does_not_know_is_not_trusted_and_not_remembered(robot, c
     for each in (estimator, other):
         each.update(reading)
     if case == "command":
-        found, doubt = estimator.update(plant_reading(estimator, command=np.array([0.0155]))), OUTSIDE
+        found, distrust = estimator.update(plant_reading(estimator, command=np.array([0.0155]))), OUTSIDE
     else:
-        found, doubt = estimator.update(replace(reading, volumes=0.9 * reading.volumes)), UNEXPLAINED
-    assert not found.trusted and found.doubt & doubt
+        found, distrust = estimator.update(replace(reading, volumes=0.9 * reading.volumes)), UNEXPLAINED
+    assert not found.trusted and found.distrust & distrust
     assert same(estimator.update(reading), other.update(reading))
 
 
 def test_forces_and_bodies_beyond_the_training_are_not_trusted(robot):
     estimator = touched(robot)
     found = estimator.update(plant_reading(estimator, force=1.15 * estimator.largest_force))
-    assert found.load[0] > estimator.largest_force and found.doubt == OUTSIDE
+    assert found.load[0] > estimator.largest_force and found.distrust == OUTSIDE
     other = LearnedEstimator(robot, design={"poisson_ratio": 0.4}, noise=NOISE, exact=True)
     assert touched(robot).knows_body and not other.knows_body
-    assert other.update(Readings(COMMAND, other.rest_volumes - 5e-8)).doubt & OUTSIDE
+    assert other.update(Readings(COMMAND, other.rest_volumes - 5e-8)).distrust & OUTSIDE
 
 
 def test_a_small_steady_error_does_not_become_unexplained_with_the_number_of_readings(robot):

@@ -130,11 +130,11 @@ class ChainBody:
         full = np.concatenate([effort, np.zeros(3)])
         W = compliance[0]
         free = np.concatenate([displacement, effector]) - W @ full
-        doubt = int(self._prepared.doubt[0])
+        distrust = int(self._prepared.distrust[0])
         if not stable[0]:
-            doubt |= SOFT
+            distrust |= SOFT
         if self._self_contact and states.folded[0]:
-            doubt |= SELF_CONTACT
+            distrust |= SELF_CONTACT
         return State(
             command=command.copy(),
             displacement=displacement,
@@ -144,7 +144,7 @@ class ChainBody:
             condensed=CondensedModel(W, free, full, ROLES, self._labels()),
             stable=bool(stable[0]),
             uncertainty=float(self._prepared.tip_uncertainty[0]),
-            doubt=doubt,
+            distrust=distrust,
             contacts=self._contacts(touch, float(states.clearance[0])),
             memory=memory,
         )

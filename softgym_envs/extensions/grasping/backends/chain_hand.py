@@ -269,10 +269,10 @@ class ChainHand:
         return np.array([x, 0.0, z + self.memory.drives[2]])
 
     @property
-    def doubt(self) -> int:
-        """Why the present state is not trusted, 0 if it is (`softgym_envs.surrogate.domain.DOUBTS`)."""
+    def distrust(self) -> int:
+        """Why the present state is not trusted, 0 if it is (`softgym_envs.surrogate.domain.DISTRUST_REASONS`)."""
         folded = self._self_contact and np.isfinite(self.memory.fold).any()
-        return int(self._prepared.doubt[0]) | (SELF_CONTACT if folded else 0)
+        return int(self._prepared.distrust[0]) | (SELF_CONTACT if folded else 0)
 
     @property
     def uncertainty(self) -> float:
@@ -508,7 +508,7 @@ class ChainHandBackend(Backend):
             velocity=velocity,
             stable=stable,
             uncertainty=hand.uncertainty,
-            doubt=hand.doubt,
+            distrust=hand.distrust,
             contacts=hand.contacts(),
             memory=memory,
         )

@@ -48,8 +48,8 @@ class PreparedChains:
         bodies: their geometry.
         stiffness: of the segments at the baseline modulus, shape (S, N - 1, 3, 3).
         relative: Young's modulus relative to the baseline, shape (S,).
-        doubt: `OUTSIDE` where the chain was not trained, plus `SPREAD` where the members disagree; 0 for known bodies,
-            shape (S,).
+        distrust: `OUTSIDE` where the chain was not trained, plus `SPREAD` where the members disagree; 0 for known
+            bodies, shape (S,).
         uncertainty: bound on the relative error of the compliance, shape (S,).
         tip_uncertainty: bound on 95 % of the errors of the tip in contact [m], shape (S,).
         depth: compliance of the tip along z at the baseline modulus [m/N], shape (S,).
@@ -59,7 +59,7 @@ class PreparedChains:
     bodies: ChainBodies
     stiffness: np.ndarray
     relative: np.ndarray
-    doubt: np.ndarray
+    distrust: np.ndarray
     uncertainty: np.ndarray
     tip_uncertainty: np.ndarray
     depth: np.ndarray
@@ -70,7 +70,7 @@ class PreparedChains:
     @property
     def known(self) -> np.ndarray:
         """Whether the chain knows each body, shape (S,)."""
-        return self.doubt == 0
+        return self.distrust == 0
 
     @property
     def segments(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -156,7 +156,7 @@ class ChainModel:
             bodies=bodies,
             stiffness=members.mean(axis=0),
             relative=relative_stiffness(self.robot, designs),
-            doubt=np.where(inside, 0, OUTSIDE) | np.where(spread <= self._limit, 0, SPREAD),
+            distrust=np.where(inside, 0, OUTSIDE) | np.where(spread <= self._limit, 0, SPREAD),
             uncertainty=self._inflation * spread,
             tip_uncertainty=self._tip_inflation * spread,
             depth=self.depth(designs),

@@ -131,17 +131,17 @@ class ContactQP(InverseQP):
             ConvergenceError: if no set of closed contacts allows a step within the limits.
         """
         found = self.problem(condensed, goal, command, slack, forces=forces, size=size)
-        problem, rubs = found.program, found.rubbing
-        a, t, h = len(self.rates), len(rubs.owner), len(rubs.held)
+        problem, tangential = found.program, found.rubbing
+        a, t, h = len(self.rates), len(tangential.owner), len(tangential.held)
         c = len(problem.pairs) - 2 * t
         before = _efforts(condensed)
-        start = _present_sets(condensed, c, rubs, before) if t else _closed_at_present_efforts(problem, a)
+        start = _present_sets(condensed, c, tangential, before) if t else _closed_at_present_efforts(problem, a)
         self.optimum = solve_qpcc(problem, start, max_programs=self.max_programs)
         step = found.base @ self.optimum.z[: a + c + t + h]
         step[a : a + c + t] -= before[a:]
         W, delta = _blocks(condensed)
         n = a + c + t
-        moved = delta + W[:, :n] @ step[:n] + rubs.columns(W) @ step[n:]
+        moved = delta + W[:, :n] @ step[:n] + tangential.columns(W) @ step[n:]
         self.effort = before[:a] + step[:a]
         self.contact_force, self.friction_force = np.split(before[a:] + step[a:n], [c])
         self.displacement, self.opening, self.slip, self.effector = np.split(moved, [a, a + c, n])
@@ -211,8 +211,8 @@ class ContactQP(InverseQP):
         n = len(delta) - wanted.size
         before = _efforts(condensed)
         limits = self.limits(condensed, command, slack, size)
-        rubs = _Rubbing.of(condensed, a)
-        t = len(rubs.owner)
+        tangential = _Rubbing.of(condensed, a)
+        t = len(tangential.owner)
 
         # Lengths that count as one: the rates of actuators, and for contacts the motion that they cause.
         # An open contact of a point that cannot move has no compliance; it stays open whatever its scale.
@@ -227,7 +227,7 @@ class ContactQP(InverseQP):
         scale = length * stiffness
 
         # Errors are linear in the changes of actuator efforts, the forces, and the excess over lower limits.
-        every = np.concatenate([W[:, :n], rubs.columns(W)], axis=1)
+        every = np.concatenate([W[:, :n], tangential.columns(W)], axis=1)
         errors = [root[:, None] * every[n:]]
         offsets = [root * (delta[n:] - wanted)]
         names = self.contact_names(condensed)
@@ -235,7 +235,7 @@ class ContactQP(InverseQP):
         columns = np.zeros((wanted.size + len(forces), len(forces)))
         for number, force in enumerate(forces):
             row, offset, width = _force_error(force, names, a, W, delta, before)
-            errors.append(np.append(row, np.zeros(len(rubs.held)))[None])
+            errors.append(np.append(row, np.zeros(len(tangential.held)))[None])
             offsets.append(np.array([offset]))
             columns[wanted.size + number, number] = -reach
             excess[number] = min(width / reach, UNBOUNDED)
@@ -253,10 +253,10 @@ class ContactQP(InverseQP):
         quadratic = (modes * np.abs(energies)) @ modes.T
 
         # Variables: see `ContactProblem`. So far, forces were changes.
-        base = rubs.base(scale)
-        start = np.concatenate([np.zeros(a), before[a:] / scale[a:], np.zeros(len(rubs.held))])
+        base = tangential.base(scale)
+        start = np.concatenate([np.zeros(a), before[a:] / scale[a:], np.zeros(len(tangential.held))])
         if t:
-            start[n - t : n] += rubs.coefficient * before[rubs.contact] / scale[n - t : n]
+            start[n - t : n] += tangential.coefficient * before[tangential.contact] / scale[n - t : n]
         count = base.shape[1]
         extra = np.zeros((len(J), len(forces) + t))
         extra[:, : len(forces)] = columns
@@ -275,16 +275,18 @@ class ContactQP(InverseQP):
         shift = rows @ start
         low, high = (np.clip(b / length[:a], -UNBOUNDED, UNBOUNDED) + shift[:a] for b in limits.displacement)
         effort_low, effort_high = (np.clip(b / scale[:a], -UNBOUNDED, UNBOUNDED) for b in limits.effort)
-        ties = np.zeros((len(rubs.held), len(start)))
-        ties[:, :count] = rubs.ties(every) @ base / length[rubs.held, None]
+        ties = np.zeros((len(tangential.held), len(start)))
+        ties[:, :count] = tangential.ties(every) @ base / length[tangential.held, None]
         tied = ties @ start
         # Slips along the directions of friction, and the distances of friction from its limits.
         slips, other = rows[n - t :].copy(), np.zeros((t, len(start)))
         sliding = len(start) - t + np.arange(t)
         slips[range(t), sliding] = 1.0
-        other[range(t), rubs.contact] = 2.0 * rubs.coefficient * scale[rubs.contact] / scale[n - t : n]
+        other[range(t), tangential.contact] = (
+            2.0 * tangential.coefficient * scale[tangential.contact] / scale[n - t : n]
+        )
         other[range(t), n - t + np.arange(t)] = -1.0
-        free = np.full(len(rubs.held), -UNBOUNDED), np.full(len(rubs.held), UNBOUNDED)
+        free = np.full(len(tangential.held), -UNBOUNDED), np.full(len(tangential.held), UNBOUNDED)
         lower = [effort_low, np.zeros(n - a), free[0], np.zeros(len(forces) + t)]
         upper = [np.maximum(effort_high, effort_low), np.full(n - a, UNBOUNDED), free[1], excess, np.full(t, UNBOUNDED)]
         problem = ComplementarityQP(
@@ -299,7 +301,7 @@ class ContactQP(InverseQP):
             pair_rows=np.concatenate([rows[a : n - t], slips, other]),
             pair_offset=np.concatenate([delta[a:n] / length[a:] - shift[a:], np.zeros(t)]),
         )
-        return ContactProblem(problem, base, limits, rubs)
+        return ContactProblem(problem, base, limits, tangential)
 
 
 class ContactProblem(NamedTuple):
@@ -429,17 +431,17 @@ def _closed_at_present_efforts(problem: ComplementarityQP, actuators: int) -> np
     return None if forces is None else forces[None] > 0.0
 
 
-def _present_sets(condensed: CondensedModel, contacts: int, rubs: _Rubbing, before: np.ndarray) -> np.ndarray:
+def _present_sets(condensed: CondensedModel, contacts: int, tangential: _Rubbing, before: np.ndarray) -> np.ndarray:
     """Closed pairs of states that need no change of actuators, shape (2, k + 2 t): all points stick; or slide on.
 
     A point that slides on keeps the direction of its friction force.
     """
-    a = len(before) - contacts - len(rubs.owner)
+    a = len(before) - contacts - len(tangential.owner)
     pressing = before[a : a + contacts] > 0.0
-    friction, limit = before[a + contacts :], rubs.coefficient * before[rubs.contact]
+    friction, limit = before[a + contacts :], tangential.coefficient * before[tangential.contact]
     at_limit = np.abs(friction) >= (1.0 - 1e-6) * limit
     # Of an open contact, both limits of friction are zero, and points slip either way.
-    touching = pressing[rubs.owner]
+    touching = pressing[tangential.owner]
     stick = np.concatenate([pressing, touching, ~touching])
     up, down = touching & at_limit & (friction > 0.0), touching & at_limit & (friction <= 0.0)
     slide = np.concatenate([pressing, touching & ~down, ~touching | up])
