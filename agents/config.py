@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import (
+    Field,
+    SerializationInfo,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    model_serializer,
+    model_validator,
+)
 
+from softgym_envs.agents.learners import LEARNERS
 from softgym_envs.backends.time_steps import shared_options
-from softgym_envs.config import BesideConfig, Config
+from softgym_envs.config import BesideConfig, Config, first_problem
 from softgym_envs.envs.options import EnvironmentOptions, default_backend, set_up
 from softgym_envs.envs.registration import EnvironmentRow, find_row
 from softgym_envs.envs.tasks.registry import TASKS, make_task
@@ -190,171 +198,65 @@ class EnvironmentConfig(Config):
         )
 
 
-class SACConfig(Config):
-    """Hyperparameters of soft actor-critic, named as in stable-baselines3."""
-
-    learning_rate: float = Field(default=1e-3, gt=0)
-    final_learning_rate: float = Field(default=1e-4, gt=0, description="reached linearly at the last step")
-    batch_size: int = Field(default=256, gt=0)
-    buffer_size: int = Field(default=100_000, gt=0)
-    gamma: float = Field(default=0.95, gt=0, le=1)
-    tau: float = Field(default=0.01, gt=0, le=1)
-    learning_starts: int = Field(default=1_000, ge=0)
-    gradient_steps: int = Field(default=8, gt=0, description="per step of all environments together")
-    net_arch: list[int] = [128, 128]
-    ent_coef: float | str = "auto"
-    target_entropy: float | Literal["auto"] = "auto"
-    warm_up: Literal["actions", "postures"] = Field(
-        default="actions",
-        description="before learning starts: random actions, or in each episode straight to a random command",
-    )
-    hindsight: float = Field(
-        default=0.0,
-        ge=0,
-        le=1,
-        description="share of samples with a position reached later as goal; 0.8 is k = 4",
-    )
-
-    @field_validator("ent_coef")
-    @classmethod
-    def _entropy(cls, value: float | str) -> float | str:
-        if isinstance(value, str) and value != "auto":
-            start = value.removeprefix("auto_")
-            try:
-                positive = value.startswith("auto_") and float(start) > 0.0
-            except ValueError:
-                positive = False
-            if not positive:
-                raise ValueError("must be a number, 'auto' or 'auto_<positive start>'")
-        return value
-
-    @field_validator("net_arch")
-    @classmethod
-    def _layers(cls, value: list[int]) -> list[int]:
-        return check_layers(value)
-
-
-def check_layers(widths: list[int]) -> list[int]:
-    """Return the widths of hidden layers.
-
-    Raises:
-        ValueError: for a width below 1.
-    """
-    if any(width < 1 for width in widths):
-        raise ValueError("must be positive widths")
-    return widths
-
-
-class PPOConfig(Config):
-    """Hyperparameters of proximal policy optimisation, named as in stable-baselines3."""
-
-    learning_rate: float = Field(default=1e-3, gt=0)
-    final_learning_rate: float = Field(default=1e-4, gt=0, description="reached linearly at the last step")
-    n_steps: int = Field(default=25, gt=0, description="of each environment between updates")
-    batch_size: int = Field(default=400, gt=1, description="at most all steps between updates")
-    n_epochs: int = Field(default=6, gt=0)
-    gamma: float = Field(default=0.9, gt=0, le=1)
-    gae_lambda: float = Field(default=0.9, gt=0, le=1)
-    clip_range: float = Field(default=0.2, gt=0)
-    ent_coef: float = Field(default=0.0, ge=0)
-    log_std_init: float = -0.5
-    net_arch: list[int] = [64, 64]
-
-    @field_validator("net_arch")
-    @classmethod
-    def _layers(cls, value: list[int]) -> list[int]:
-        return check_layers(value)
-
-
-class GradientConfig(Config):
-    """Hyperparameters of the learners that know the model."""
-
-    learning_rate: float = Field(default=2e-3, gt=0)
-    final_learning_rate: float = Field(default=4e-5, gt=0, description="reached linearly at the last step")
-    net_arch: list[int] = [128, 128]
-    members: int | None = Field(
-        default=1, ge=1, description="of the surrogate's ensemble, in training; evaluations use all"
-    )
-
-    @field_validator("net_arch")
-    @classmethod
-    def _layers(cls, value: list[int]) -> list[int]:
-        return check_layers(value)
-
-
-class AnalyticConfig(GradientConfig):
-    """Hyperparameters of the analytic policy gradient (`softgym_envs.agents.learners.analytic`)."""
-
-    slack_pull: float = Field(
-        default=0.3, ge=0, description="how strongly commands of slack cables follow the displacement that is reached"
-    )
-    effort_weight: float = Field(
-        default=1.0,
-        ge=0,
-        description="factor of the effort's share in the derivatives; above 1 for redundant actuators, which otherwise "
-        "end up working against each other",
-    )
-
-
-class CloningConfig(GradientConfig):
-    """Hyperparameters of the imitation of the inverse QP (`softgym_envs.agents.learners.cloning`)."""
-
-    batch_size: int = Field(default=256, gt=0)
-    gradient_steps: int = Field(default=8, gt=0, description="per step of all environments together")
-    lead: float = Field(
-        default=0.2, gt=0, le=1, description="share of the steps until the policy acts alone in all environments"
-    )
-
-
-class RecurrentConfig(GradientConfig):
-    """Hyperparameters of the imitation by a network with memory (`softgym_envs.extensions.learners.recurrent`)."""
-
-    net_arch: list[int] = Field(default=[64], min_length=1, max_length=1, description="width of the memory")
-    batch_size: int = Field(default=32, gt=0, description="episodes of each update")
-    gradient_steps: int = Field(default=8, gt=0, description="updates after each episode")
-    lead: float = Field(
-        default=0.2, gt=0, le=1, description="share of the steps until the policy acts alone in all episodes"
-    )
-
-
-class EvolutionConfig(Config):
-    """Hyperparameters of the evolution of weights (`softgym_envs.extensions.learners.evolution`)."""
-
-    step_size: float = Field(default=0.2, gt=0, description="first standard deviation of each weight")
-    net_arch: list[int] = Field(default=[], description="widths of hidden layers; none for a linear policy")
-
-    @field_validator("net_arch")
-    @classmethod
-    def _layers(cls, value: list[int]) -> list[int]:
-        return check_layers(value)
-
-
 class LearnerConfig(Config):
     """A learning method and its hyperparameters.
 
+    In a file, the hyperparameters stand under the name of the learner: ``sac: {gamma: 0.9}``.
+
     Attributes:
-        learner: ``"sac"``, ``"ppo"`` or ``"evolution"``, model-free, for every environment; or, model-based,
-            ``"analytic"``, which follows derivatives of the reward and needs the surrogate, ``"cloning"``, which
-            imitates the inverse QP, or ``"recurrent"``, which imitates it with a memory where goals are positions.
-        sac: hyperparameters of SAC.
-        ppo: hyperparameters of PPO.
-        analytic: hyperparameters of the analytic policy gradient.
-        cloning: hyperparameters of the imitation.
-        recurrent: hyperparameters of the imitation with a memory.
-        evolution: hyperparameters of the evolution of weights.
-        num_envs: number of sub-environments; for ``"evolution"`` the size of a generation.
+        learner: a name in `softgym_envs.agents.learners.LEARNERS`.
+        settings: hyperparameters, of the class ``Config`` of the learner.
+        num_envs: number of sub-environments; for evolution the size of a generation.
         seed: seed of everything random.
     """
 
-    learner: Literal["sac", "ppo", "analytic", "cloning", "recurrent", "evolution"] = "sac"
-    sac: SACConfig = Field(default_factory=SACConfig)
-    ppo: PPOConfig = Field(default_factory=PPOConfig)
-    analytic: AnalyticConfig = Field(default_factory=AnalyticConfig)
-    cloning: CloningConfig = Field(default_factory=CloningConfig)
-    recurrent: RecurrentConfig = Field(default_factory=RecurrentConfig)
-    evolution: EvolutionConfig = Field(default_factory=EvolutionConfig)
+    learner: str = "sac"
+    settings: Any = None
     num_envs: int = Field(default=16, gt=0)
     seed: int = Field(default=0, ge=0)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _settings_of_learner(cls, data: Any) -> Any:
+        """Make the settings from the section with the learner's name; refuse sections of other learners."""
+        if not isinstance(data, dict):
+            return data
+        name = data.get("learner", cls.model_fields["learner"].default)
+        kind = LEARNERS.find(name).Config
+        settings, section = data.get("settings"), data.get(name, {})
+        if settings is None:
+            try:
+                settings = kind.model_validate(section)
+            except ValidationError as error:
+                inside = "." if error.errors()[0]["loc"] else ": "
+                raise ValueError(f"{name}{inside}{first_problem(error)}") from None
+        elif not isinstance(settings, kind):
+            raise ValueError(
+                f"settings of learner '{name}' stand under '{name}' in a file, got settings = {settings!r}"
+            )
+        for other in set(LEARNERS) & set(data) - {name}:
+            raise ValueError(f"{other} = {data[other]!r} has no effect on learner '{name}'; allowed: {name}")
+        return {**{key: value for key, value in data.items() if key != name}, "settings": settings}
+
+    @model_serializer(mode="wrap")
+    def _section_of_learner(self, handler: SerializerFunctionWrapHandler, info: SerializationInfo) -> dict[str, Any]:
+        data: dict[str, Any] = handler(self)
+        if info.exclude_unset and not data["settings"]:
+            del data["settings"]
+        return {self.learner if key == "settings" else key: value for key, value in data.items()}
+
+    def check_training(
+        self, environment: EnvironmentConfig, steps: int | None, *, section: str = "", end: str = "steps"
+    ) -> None:
+        """Raise ValueError for hyperparameters that contradict an environment or the length of a training.
+
+        Args:
+            environment: what the policy is trained in.
+            steps: environment steps of the training; None if they are not known.
+            section: of these hyperparameters, for messages: ``"training."``.
+            end: key of the number of steps, for messages.
+        """
+        LEARNERS[self.learner].check(self.settings, environment, steps, section=section, end=end)
 
 
 class TrainConfig(LearnerConfig):
@@ -377,33 +279,5 @@ class TrainConfig(LearnerConfig):
 
     @model_validator(mode="after")
     def _consistent(self) -> TrainConfig:
-        if self.learner == "sac":
-            check_hindsight(self.sac, self.environment)
-            check_start("sac.learning_starts", self.sac, "steps", self.steps)
+        self.check_training(self.environment, self.steps)
         return self
-
-
-def check_hindsight(sac: SACConfig, environment: EnvironmentConfig) -> None:
-    """Raise ValueError for hindsight goals with a residual agent."""
-    # The stored actions include the QP's action for the original goal, so they do not fit another goal.
-    if sac.hindsight and environment.residual_scale:
-        raise ValueError(
-            f"sac.hindsight = {sac.hindsight:g} cannot be combined with environment.residual_scale = "
-            f"{environment.residual_scale:g}: the QP's action depends on the goal; allowed: 0"
-        )
-
-
-def check_start(key: str, sac: SACConfig, end: str, steps: int) -> None:
-    """Raise ValueError for a training that would end before its first update.
-
-    Args:
-        key: key of ``learning_starts``, for the message.
-        sac: hyper-parameters.
-        end: key of the number of steps, for the message.
-        steps: environment steps of the training.
-    """
-    if sac.learning_starts >= steps:
-        raise ValueError(
-            f"{key} = {sac.learning_starts} must be below {end} = {steps}, or nothing would be learned; "
-            f"allowed: 0 to {steps - 1}"
-        )

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, TypedDict
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from softgym_envs.agents.baselines import BASELINES
 from softgym_envs.agents.config import EnvironmentConfig
+from softgym_envs.agents.learners import LEARNERS
 from softgym_envs.agents.statistics import Estimate, crossed_estimate, stratified_estimate
 from softgym_envs.errors import DataError
 from softgym_envs.storage import read_json
@@ -23,34 +25,21 @@ if TYPE_CHECKING:
 RESULTS = Path(__file__).parent / "results"
 """Stored runs of the configurations in ``configs/agents``."""
 
-LEARNERS = {
-    "sac": "SAC",
-    "ppo": "PPO",
-    "evolution": "evolution",
-    "analytic": "analytic gradient",
-    "cloning": "cloning",
-    "recurrent": "recurrent",
-}
-"""Titles of the learners."""
-
-MODEL_BASED = ("analytic", "cloning", "recurrent")
-"""Learners that know the model of the robot, as the inverse QP does; the others are model-free."""
-
 
 def agent_titles() -> dict[str, str]:
     """Return the titles of all agents by name: learners, then agents that need no training."""
-    return LEARNERS | {name: cls.title for name, cls in BASELINES.items()}
+    return {name: cls.title for name, cls in LEARNERS.items()} | {name: cls.title for name, cls in BASELINES.items()}
 
 
 #: Colours of the curves of each learner: single seeds, and their mean.
-_COLOURS = {
-    "sac": ("#99d0ca", "#0f766e"),
-    "ppo": ("#a9bff0", "#1d4ed8"),
-    "analytic": ("#f3c49a", "#c2570c"),
-    "cloning": ("#d3b5ea", "#7e22ce"),
-    "recurrent": ("#b9d59b", "#4d7c0f"),
-    "evolution": ("#e3a3b5", "#be123c"),
-}
+_COLOURS = (
+    ("#99d0ca", "#0f766e"),
+    ("#a9bff0", "#1d4ed8"),
+    ("#f3c49a", "#c2570c"),
+    ("#d3b5ea", "#7e22ce"),
+    ("#e3a3b5", "#be123c"),
+    ("#b9d59b", "#4d7c0f"),
+)
 
 
 class StoredEvaluation(TypedDict):
@@ -171,13 +160,13 @@ def table(runs: list[StoredRuns]) -> str:
     """Return Markdown tables of distances and success rates on the backend of the training and on FEM, and overall."""
     counts = [Counter(run.learner for run in entry.runs) for entry in runs]
     seeds = sorted({count for each in counts for count in each.values()})
+    free, based = ([name for name, cls in LEARNERS.items() if cls.model_based is known] for known in (False, True))
     text = [
         f"Interquartile means over all seeds ({' or '.join(map(str, seeds))}) and goals, with 95 % bootstrap intervals "
         "over both (with three seeds that differ much, they cover only about 80 %). "
-        f"{_listed(agent for agent in LEARNERS if agent not in MODEL_BASED)} are model-free; "
-        f"{_listed(MODEL_BASED)} learn from the model of the robot that the QP uses. Distances are in mm, errors of "
-        "forces in %: to the goal at the end of an episode, or the mean along a path (track tasks, marked *). Policies "
-        "were chosen on other goals.\n"
+        f"{_listed(free)} are model-free; {_listed(based)} learn from the model of the robot that the QP uses. "
+        "Distances are in mm, errors of forces in %: to the goal at the end of an episode, or the mean along a path "
+        "(track tasks, marked *). Policies were chosen on other goals.\n"
     ]
     for backend, title in (("own", "On the backend of the training"), ("fem", "The same policies on FEM")):
         shown = [entry for entry in runs if backend == "own" or entry.environment.backend != "fem"]
@@ -240,7 +229,7 @@ def summary(runs: list[StoredRuns]) -> list[Summary]:
 
 
 def _listed(learners: Iterable[str]) -> str:
-    *first, last = (LEARNERS[name] for name in learners)
+    *first, last = (LEARNERS[name].title for name in learners)
     return f"{', '.join(first)} and {last}" if first else last
 
 
@@ -340,7 +329,7 @@ def draw_curves(runs: list[StoredRuns], path: str | Path, columns: int = 4) -> P
     for panel in panels[len(runs) :]:
         panel.remove()
     for panel, entry in zip(panels, runs, strict=False):
-        for learner, (light, dark) in _COLOURS.items():
+        for learner, (light, dark) in zip(LEARNERS, cycle(_COLOURS), strict=False):
             curves = [
                 ([row["step"] for row in run.curve], [row["mean_return"] / entry.horizon for row in run.curve])
                 for run in entry.runs

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softgym_envs.agents.config import EnvironmentConfig, TrainConfig
+from softgym_envs.agents.learners import LEARNERS
 from softgym_envs.config import check_config, difference, load_config, shipped_configs
 from softgym_envs.errors import ConfigError, DataError, SoftGymError
 from softgym_envs.executors import parallel_map
@@ -188,15 +189,7 @@ def _attempt(function: Callable[..., Path], arguments: tuple[Any, ...]) -> tuple
 def _cost(config: TrainConfig) -> float:
     """Return the rough CPU time of a training [s]; the longest trainings run first."""
     step = 0.02 if config.environment.backend == "fem" else 1e-4
-    updates = {
-        "sac": 0.005 * config.sac.gradient_steps,
-        "ppo": 3e-5 * config.num_envs,
-        "analytic": 0.001,
-        "cloning": 1e-4 * config.num_envs + 0.0005 * config.cloning.gradient_steps,
-        "recurrent": 0.005,
-        "evolution": 0.0,
-    }  # per step of all environments together
-    return config.steps * (step + updates[config.learner] / config.num_envs)
+    return config.steps * (step + LEARNERS[config.learner].update_seconds(config) / config.num_envs)
 
 
 def sweep(

@@ -13,7 +13,7 @@ import numpy as np
 
 from softgym_envs.agents.config import TrainConfig
 from softgym_envs.agents.evaluation import Evaluation, evaluate, evaluation_set
-from softgym_envs.agents.learners import make_learner
+from softgym_envs.agents.learners import LEARNERS
 from softgym_envs.agents.learners.base import Learner, Tensors
 from softgym_envs.agents.policy import Policy, read_tensors, save_policy
 from softgym_envs.errors import DataError, WeightsError
@@ -216,7 +216,7 @@ class _Run:
         self._curve: list[CurvePoint] = []
         self._best: Tensors = {}
         self.outcome: Evaluation | None = None
-        self.learner = make_learner(config)
+        self.learner: Learner = LEARNERS[config.learner](config)
         if self._checkpoint.exists():
             self._curve, self._best, self.outcome, spent = _restore(self.learner, self._checkpoint)
             self._began -= spent

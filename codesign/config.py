@@ -8,7 +8,6 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from softgym_envs.agents.config import check_hindsight, check_start
 from softgym_envs.agents.joint import PROPOSERS
 from softgym_envs.codesign.parts import (
     PRUNERS,
@@ -264,13 +263,12 @@ class StudyConfig(StudyProblem):
                 run.report_every > run.steps,
                 f"{key}.report_every = {run.report_every} exceeds {key}.steps = {run.steps}",
             )
-            if run.learner != "sac":
-                continue
-            check_hindsight(run.sac, self.environment)
-            if run is self.joint or own or self.finalists.steps is None:
-                check_start(f"{key}.sac.learning_starts", run.sac, f"{key}.steps", run.steps)
-        if self.training.learner == "sac" and retrained and self.finalists.steps is not None:
-            check_start("training.sac.learning_starts", self.training.sac, "finalists.steps", self.finalists.steps)
+            known = run is self.joint or own or self.finalists.steps is None
+            run.check_training(self.environment, run.steps if known else None, section=f"{key}.", end=f"{key}.steps")
+        if retrained and self.finalists.steps is not None:
+            self.training.check_training(
+                self.environment, self.finalists.steps, section="training.", end="finalists.steps"
+            )
 
     @property
     def plan(self) -> Strategy:

@@ -276,7 +276,9 @@ def difference(old: Config, new: Config, *, ignore: Sequence[str] = ()) -> str |
 def _difference(old: Any, new: Any, key: str, ignore: frozenset[str]) -> str | None:
     if key in ignore:
         return None
-    if isinstance(old, dict) and isinstance(new, dict) and old.keys() == new.keys():
-        parts = (_difference(old[name], new[name], f"{key}.{name}" if key else name, ignore) for name in old)
+    # Sections of different learners differ in their names.
+    if isinstance(old, dict) and isinstance(new, dict) and (not key or old.keys() == new.keys()):
+        names = {**old, **new}
+        parts = (_difference(old.get(name), new.get(name), f"{key}.{name}" if key else name, ignore) for name in names)
         return next((part for part in parts if part is not None), None)
     return None if old == new else f"{key} = {reprlib.repr(old)}, got {reprlib.repr(new)}"

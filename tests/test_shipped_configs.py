@@ -80,9 +80,9 @@ def test_entries_of_a_file_hold_what_differs(tmp_path):
     path = tmp_path / "several.yaml"
     path.write_text(SEVERAL)
     plain, wide, longer = (load_config(path / name, TrainConfig) for name in ("plain", "wide", "longer"))
-    assert (plain.sac.gamma, plain.sac.net_arch, plain.steps) == (0.9, [8], 2000)
-    assert (wide.sac.gamma, wide.sac.net_arch, wide.steps) == (0.9, [64], 2000)
-    assert (longer.sac.net_arch, longer.steps) == ([64], 4000)
+    assert (plain.settings.gamma, plain.settings.net_arch, plain.steps) == (0.9, [8], 2000)
+    assert (wide.settings.gamma, wide.settings.net_arch, wide.steps) == (0.9, [64], 2000)
+    assert (longer.settings.net_arch, longer.steps) == ([64], 4000)
     assert load_config(path / "wide", TrainConfig, ["steps=3000"]).steps == 3000 and wide.steps == 2000
     for place, message in (
         (path, r"several.yaml' holds several: add the name of one; allowed: plain, wide"),

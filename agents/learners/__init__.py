@@ -1,14 +1,6 @@
-"""Learning methods; each is a file with a class, its section in `TrainConfig`, and a row here or an entry point."""
+"""Learning methods. A new one is a file with a class derived from `Learner`, and a row here or an entry point."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
-from softgym_envs.agents.config import TrainConfig
 from softgym_envs.registry import Registry
-
-if TYPE_CHECKING:
-    from softgym_envs.agents.learners.base import Learner
 
 LEARNERS = Registry(
     "learner",
@@ -22,13 +14,3 @@ LEARNERS = Registry(
     group="softgym_envs.learners",
 )
 """Learners by name: those of the suite and of installed packages."""
-
-
-def make_learner(config: TrainConfig) -> Learner:
-    """Return a new learner of the method that a configuration names.
-
-    Raises:
-        ValueError: if the environment cannot be made, or the method cannot learn in it.
-    """
-    learner: Learner = LEARNERS.find(config.learner)(config)
-    return learner

@@ -12,21 +12,44 @@ it.
 from __future__ import annotations
 
 import numpy as np
+from pydantic import Field
 
 from softgym_envs.agents.config import TrainConfig
 from softgym_envs.agents.learners.gradient import GradientLearner
+from softgym_envs.agents.learners.network import GradientConfig
 from softgym_envs.envs.gradients import StepGradient
 from softgym_envs.envs.vector_env import SoftRobotVectorEnv
+
+
+class AnalyticConfig(GradientConfig):
+    """Hyperparameters of the analytic policy gradient (`softgym_envs.agents.learners.analytic`)."""
+
+    slack_pull: float = Field(
+        default=0.3, ge=0, description="how strongly commands of slack cables follow the displacement that is reached"
+    )
+    effort_weight: float = Field(
+        default=1.0,
+        ge=0,
+        description="factor of the effort's share in the derivatives; above 1 for redundant actuators, which otherwise "
+        "end up working against each other",
+    )
 
 
 class AnalyticLearner(GradientLearner):
     """Analytic policy gradient, one step deep."""
 
+    Config = AnalyticConfig
+    title = "analytic gradient"
+
+    @classmethod
+    def update_seconds(cls, config: TrainConfig) -> float:
+        return 0.001
+
     env: SoftRobotVectorEnv
 
     def __init__(self, config: TrainConfig) -> None:
-        super().__init__(config, config.analytic)
-        self.slack_pull, self.effort_weight = config.analytic.slack_pull, config.analytic.effort_weight
+        super().__init__(config, config.settings)
+        self.slack_pull, self.effort_weight = config.settings.slack_pull, config.settings.effort_weight
 
     def advance(self, observation: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         import torch

@@ -5,11 +5,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
-from softgym_envs.agents.config import TrainConfig
+from softgym_envs.agents.config import EnvironmentConfig, TrainConfig
+from softgym_envs.config import Config
 from softgym_envs.errors import WeightsError
 
 Tensors = dict[str, np.ndarray]
@@ -31,8 +32,19 @@ def check_weights(shapes: Mapping[str, Sequence[int]], tensors: Mapping[str, np.
             )
 
 
+def check_layers(widths: list[int]) -> list[int]:
+    """Return the widths of hidden layers.
+
+    Raises:
+        ValueError: for a width below 1.
+    """
+    if any(width < 1 for width in widths):
+        raise ValueError("must be positive widths")
+    return widths
+
+
 class Learner(ABC):
-    """A policy in training. One file per method, and a row in `softgym_envs.agents.learners`.
+    """A policy in training. One file per method, and a row in `softgym_envs.agents.learners` or an entry point.
 
     `train` makes a learner, restores or loads its weights, calls `learn` for one part of the training after the other,
     evaluates the policy in between and stores `weights` and `state`. A resumed training must give the same policy as
@@ -42,6 +54,9 @@ class Learner(ABC):
         config: configuration of the training.
 
     Attributes:
+        Config: its hyperparameters, `config.settings` of a training.
+        title: its name in tables.
+        model_based: whether it knows the model of the robot, as the inverse QP does.
         config: configuration of the training.
         step: environment steps so far, over all sub-environments.
 
@@ -49,7 +64,20 @@ class Learner(ABC):
         ValueError: for an environment in which the method cannot learn.
     """
 
+    Config: ClassVar[type[Config]] = Config
+    title: ClassVar[str]
+    model_based: ClassVar[bool] = False
     step: int
+
+    @classmethod
+    def check(cls, settings: Any, environment: EnvironmentConfig, steps: int | None, *, section: str, end: str) -> None:
+        """Raise ValueError for hyperparameters that contradict what `LearnerConfig.check_training` takes."""
+        return
+
+    @classmethod
+    def update_seconds(cls, config: TrainConfig) -> float:
+        """Return the rough CPU time of the updates after a step of all environments together [s]."""
+        return 0.0
 
     @abstractmethod
     def __init__(self, config: TrainConfig) -> None:

@@ -12,22 +12,41 @@ from typing import Any
 
 import numpy as np
 from gymnasium.vector import SyncVectorEnv
+from pydantic import Field
 
 from softgym_envs.agents.baselines import InverseQPAgent
 from softgym_envs.agents.config import TrainConfig
 from softgym_envs.agents.learners.base import Tensors
 from softgym_envs.agents.learners.gradient import GradientLearner
+from softgym_envs.agents.learners.network import GradientConfig
 from softgym_envs.agents.residual import BatchQP
 from softgym_envs.envs.vector_env import SoftRobotVectorEnv
+
+
+class CloningConfig(GradientConfig):
+    """Hyperparameters of the imitation of the inverse QP (`softgym_envs.agents.learners.cloning`)."""
+
+    batch_size: int = Field(default=256, gt=0)
+    gradient_steps: int = Field(default=8, gt=0, description="per step of all environments together")
+    lead: float = Field(
+        default=0.2, gt=0, le=1, description="share of the steps until the policy acts alone in all environments"
+    )
 
 
 class CloningLearner(GradientLearner):
     """Imitation of the inverse QP, on the batched environment where there is one."""
 
+    Config = CloningConfig
+    title = "cloning"
+
+    @classmethod
+    def update_seconds(cls, config: TrainConfig) -> float:
+        return 1e-4 * config.num_envs + 0.0005 * float(config.settings.gradient_steps)
+
     needs_batch = False
 
     def __init__(self, config: TrainConfig) -> None:
-        super().__init__(config, config.cloning)
+        super().__init__(config, config.settings)
         self._expert = self._make_expert()
         size = config.steps + config.num_envs
         self._observations = np.zeros((size, *self.env.single_observation_space.shape), dtype=np.float32)  # type: ignore[misc]
@@ -44,7 +63,7 @@ class CloningLearner(GradientLearner):
     def advance(self, observation: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         import torch
 
-        cloning, env = self.config.cloning, self.env
+        cloning, env = self.config.settings, self.env
         answer = self._expert()
         rows = slice(self.step, self.step + env.num_envs)
         self._observations[rows], self._answers[rows] = observation, answer

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
-from softgym_envs.agents.config import GradientConfig, TrainConfig
-from softgym_envs.agents.learners.network import NetworkLearner
+from softgym_envs.agents.config import TrainConfig
+from softgym_envs.agents.learners.network import GradientConfig, NetworkLearner
 from softgym_envs.envs.vector_env import SoftRobotVectorEnv
 
 if TYPE_CHECKING:
@@ -33,6 +33,8 @@ class GradientLearner(NetworkLearner):
         ValueError: for an environment that is not batched if the method needs it, or a correction of the QP.
     """
 
+    model_based = True
+
     needs_batch: ClassVar[bool] = True
     env: VectorEnv
 
@@ -44,7 +46,7 @@ class GradientLearner(NetworkLearner):
             raise ValueError(
                 f"learner '{config.learner}' needs environment.backend = surrogate, or fem for robots of beams, and no "
                 f"residual_scale, got backend {environment.backend} and residual_scale {environment.residual_scale:g}; "
-                "allowed here: learner 'sac', 'ppo' or 'evolution'"
+                "allowed here: a model-free learner, such as 'sac' or 'ppo'"
             )
         super().__init__(config)
         if environment.batched:

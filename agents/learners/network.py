@@ -7,15 +7,32 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from pydantic import Field, field_validator
 
-from softgym_envs.agents.config import GradientConfig
-from softgym_envs.agents.learners.base import Learner, Tensors, check_weights
+from softgym_envs.agents.learners.base import Learner, Tensors, check_layers, check_weights
+from softgym_envs.config import Config
 
 if TYPE_CHECKING:
     import torch
 
 LARGEST_GRADIENT = 1.0
 """Largest norm of the gradient of all weights."""
+
+
+class GradientConfig(Config):
+    """Hyperparameters of the learners that know the model."""
+
+    learning_rate: float = Field(default=2e-3, gt=0)
+    final_learning_rate: float = Field(default=4e-5, gt=0, description="reached linearly at the last step")
+    net_arch: list[int] = [128, 128]
+    members: int | None = Field(
+        default=1, ge=1, description="of the surrogate's ensemble, in training; evaluations use all"
+    )
+
+    @field_validator("net_arch")
+    @classmethod
+    def _layers(cls, value: list[int]) -> list[int]:
+        return check_layers(value)
 
 
 class NetworkLearner(Learner):

@@ -8,14 +8,16 @@ from typing import Any
 
 import numpy as np
 import torch
+from pydantic import Field, field_validator
 from stable_baselines3 import PPO
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch.optim import Optimizer
 
 from softgym_envs.agents.config import TrainConfig
-from softgym_envs.agents.learners.base import Tensors, check_weights
+from softgym_envs.agents.learners.base import Tensors, check_layers, check_weights
 from softgym_envs.agents.learners.sb3 import SB3Learner
 from softgym_envs.agents.vec_env import SB3VecEnv
+from softgym_envs.config import Config
 from softgym_envs.envs.vector_env import SoftRobotVectorEnv
 
 #: Parts of the model of stable-baselines3, and their names in a policy file.
@@ -36,6 +38,27 @@ class TanhPolicy(ActorCriticPolicy):
         self.action_net = torch.nn.Sequential(self.action_net, torch.nn.Tanh())
 
 
+class PPOConfig(Config):
+    """Hyperparameters of proximal policy optimisation, named as in stable-baselines3."""
+
+    learning_rate: float = Field(default=1e-3, gt=0)
+    final_learning_rate: float = Field(default=1e-4, gt=0, description="reached linearly at the last step")
+    n_steps: int = Field(default=25, gt=0, description="of each environment between updates")
+    batch_size: int = Field(default=400, gt=1, description="at most all steps between updates")
+    n_epochs: int = Field(default=6, gt=0)
+    gamma: float = Field(default=0.9, gt=0, le=1)
+    gae_lambda: float = Field(default=0.9, gt=0, le=1)
+    clip_range: float = Field(default=0.2, gt=0)
+    ent_coef: float = Field(default=0.0, ge=0)
+    log_std_init: float = -0.5
+    net_arch: list[int] = [64, 64]
+
+    @field_validator("net_arch")
+    @classmethod
+    def _layers(cls, value: list[int]) -> list[int]:
+        return check_layers(value)
+
+
 class PPOLearner(SB3Learner):
     """Proximal policy optimisation on batched environments.
 
@@ -43,11 +66,18 @@ class PPOLearner(SB3Learner):
         model: that of stable-baselines3.
     """
 
+    Config = PPOConfig
+    title = "PPO"
+
+    @classmethod
+    def update_seconds(cls, config: TrainConfig) -> float:
+        return 3e-5 * config.num_envs
+
     model: PPO
 
     def __init__(self, config: TrainConfig) -> None:
         super().__init__(config)
-        ppo = config.ppo
+        ppo = config.settings
         self.model = PPO(
             TanhPolicy,
             SB3VecEnv(config.environment.make_vec(config.num_envs)),

@@ -4,19 +4,65 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from pydantic import Field, field_validator
 
-from softgym_envs.agents.config import TrainConfig
-from softgym_envs.agents.learners.base import Tensors, check_weights
+from softgym_envs.agents.config import EnvironmentConfig, TrainConfig
+from softgym_envs.agents.learners.base import Tensors, check_layers, check_weights
 from softgym_envs.agents.learners.sb3 import SB3Learner
+from softgym_envs.config import Config
 
 if TYPE_CHECKING:
     from stable_baselines3 import SAC
     from torch.optim import Optimizer
 
 _BUFFER = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts", "ends")
+
+
+class SACConfig(Config):
+    """Hyperparameters of soft actor-critic, named as in stable-baselines3."""
+
+    learning_rate: float = Field(default=1e-3, gt=0)
+    final_learning_rate: float = Field(default=1e-4, gt=0, description="reached linearly at the last step")
+    batch_size: int = Field(default=256, gt=0)
+    buffer_size: int = Field(default=100_000, gt=0)
+    gamma: float = Field(default=0.95, gt=0, le=1)
+    tau: float = Field(default=0.01, gt=0, le=1)
+    learning_starts: int = Field(default=1_000, ge=0)
+    gradient_steps: int = Field(default=8, gt=0, description="per step of all environments together")
+    net_arch: list[int] = [128, 128]
+    ent_coef: float | str = "auto"
+    target_entropy: float | Literal["auto"] = "auto"
+    warm_up: Literal["actions", "postures"] = Field(
+        default="actions",
+        description="before learning starts: random actions, or in each episode straight to a random command",
+    )
+    hindsight: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="share of samples with a position reached later as goal; 0.8 is k = 4",
+    )
+
+    @field_validator("ent_coef")
+    @classmethod
+    def _entropy(cls, value: float | str) -> float | str:
+        if isinstance(value, str) and value != "auto":
+            start = value.removeprefix("auto_")
+            try:
+                positive = value.startswith("auto_") and float(start) > 0.0
+            except ValueError:
+                positive = False
+            if not positive:
+                raise ValueError("must be a number, 'auto' or 'auto_<positive start>'")
+        return value
+
+    @field_validator("net_arch")
+    @classmethod
+    def _layers(cls, value: list[int]) -> list[int]:
+        return check_layers(value)
 
 
 class SACLearner(SB3Learner):
@@ -26,12 +72,33 @@ class SACLearner(SB3Learner):
         model: that of stable-baselines3.
     """
 
+    Config = SACConfig
+    title = "SAC"
+
+    @classmethod
+    def check(cls, settings: Any, environment: EnvironmentConfig, steps: int | None, *, section: str, end: str) -> None:
+        # The stored actions include the QP's action for the original goal, so they do not fit another goal.
+        if settings.hindsight and environment.residual_scale:
+            raise ValueError(
+                f"sac.hindsight = {settings.hindsight:g} cannot be combined with environment.residual_scale = "
+                f"{environment.residual_scale:g}: the QP's action depends on the goal; allowed: 0"
+            )
+        if steps is not None and settings.learning_starts >= steps:
+            raise ValueError(
+                f"{section}sac.learning_starts = {settings.learning_starts} must be below {end} = {steps}, or nothing "
+                f"would be learned; allowed: 0 to {steps - 1}"
+            )
+
+    @classmethod
+    def update_seconds(cls, config: TrainConfig) -> float:
+        return 0.005 * float(config.settings.gradient_steps)
+
     model: SAC
 
     def __init__(self, config: TrainConfig) -> None:
         super().__init__(config)
         self.model = make_model(config)
-        self.schedule_learning_rate(config.sac.learning_rate, config.sac.final_learning_rate)
+        self.schedule_learning_rate(config.settings.learning_rate, config.settings.final_learning_rate)
 
     def begin(self) -> None:
         """End the running episodes in the replay buffer."""
@@ -96,7 +163,7 @@ def make_model(config: TrainConfig) -> SAC:
     from softgym_envs.agents.warm_up import PostureSAC
 
     env = SB3VecEnv(config.environment.make_vec(config.num_envs))
-    sac = config.sac
+    sac = config.settings
     postures = sac.warm_up == "postures"
     extra: dict[str, Any] = {}
     if sac.hindsight or postures:

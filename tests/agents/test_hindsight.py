@@ -152,7 +152,7 @@ def test_hindsight_on_top_of_the_qp_is_refused():
     with pytest.raises(ValueError, match=r"sac\.hindsight = 0\.8 .*environment\.residual_scale = 0\.3.* allowed: 0"):
         TrainConfig.model_validate(config)
     assert TrainConfig.model_validate({**config, "sac": {}}).environment.residual_scale == 0.3
-    assert TrainConfig.model_validate({**config, "environment": {"id": REACH.id}}).sac.hindsight == 0.8
+    assert TrainConfig.model_validate({**config, "environment": {"id": REACH.id}}).settings.hindsight == 0.8
 
 
 def test_a_moving_goal_is_refused():

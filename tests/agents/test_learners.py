@@ -1,12 +1,10 @@
 """Learners other than SAC: what they learn, files, resumption, warm starts and what they refuse."""
 
-from importlib import import_module
-
 import numpy as np
 import pytest
 import torch
 
-from softgym_envs.agents.config import EvolutionConfig, RecurrentConfig, TrainConfig
+from softgym_envs.agents.config import TrainConfig
 from softgym_envs.agents.evaluation import evaluate, sample_goals
 from softgym_envs.agents.learners import LEARNERS
 from softgym_envs.agents.learners.analytic import AnalyticLearner
@@ -17,8 +15,8 @@ from softgym_envs.agents.residual import BatchQP
 from softgym_envs.agents.training import CHECKPOINT, _restore, train
 from softgym_envs.errors import DataError, WeightsError
 from softgym_envs.extensions.deployment.policy_onnx import exported_spaces
-from softgym_envs.extensions.learners.evolution import EvolutionLearner
-from softgym_envs.extensions.learners.recurrent import RecurrentLearner
+from softgym_envs.extensions.learners.evolution import EvolutionConfig, EvolutionLearner
+from softgym_envs.extensions.learners.recurrent import RecurrentConfig, RecurrentLearner
 from softgym_envs.extensions.modules.modular_arm import KINDS
 from tests.agents.interruption import interrupted_at
 
@@ -64,16 +62,19 @@ def test_an_untrained_policy_keeps_still():
     learner.close()
 
 
+def short(learner, **changes):
+    """The configuration `SHORT` for another learner."""
+    data = SHORT.model_dump()
+    del data["analytic"]
+    return TrainConfig.model_validate({**data, "learner": learner, **changes})
+
+
 QUICK = {
     "analytic": SHORT,
-    "cloning": SHORT.model_copy(update={"learner": "cloning"}),
-    "ppo": TrainConfig.model_validate({**SHORT.model_dump(), "learner": "ppo", "ppo": {"n_steps": 2, "n_epochs": 2}}),
-    "recurrent": TrainConfig.model_validate(
-        {**SHORT.model_dump(), "learner": "recurrent", "num_envs": 1, "recurrent": {"gradient_steps": 1}}
-    ),
-    "evolution": TrainConfig.model_validate(
-        {**SHORT.model_dump(), "learner": "evolution", "num_envs": 8, "evolution": {"net_arch": [3]}}
-    ),
+    "cloning": short("cloning"),
+    "ppo": short("ppo", ppo={"n_steps": 2, "n_epochs": 2}),
+    "recurrent": short("recurrent", num_envs=1, recurrent={"gradient_steps": 1}),
+    "evolution": short("evolution", num_envs=8, evolution={"net_arch": [3]}),
 }
 
 
@@ -83,13 +84,12 @@ def test_same_seed_same_policy_and_interruptions_change_nothing(name, tmp_path):
     first = train(config, tmp_path / "first", progress=False).read_bytes()
     assert train(config, tmp_path / "again", progress=False).read_bytes() == first
     assert train(config.model_copy(update={"seed": 1}), tmp_path / "other", progress=False).read_bytes() != first
-    module, _, name = LEARNERS[name].partition(":")
-    with interrupted_at(getattr(import_module(module), name), 512):
+    with interrupted_at(LEARNERS[name], 512):
         train(config, tmp_path / "resumed", progress=False)
     torch.manual_seed(5)  # a new process would have other random states
     assert train(config, tmp_path / "resumed", progress=False).read_bytes() == first
     with pytest.raises(DataError, match="learner"):
-        train(config.model_copy(update={"learner": "sac"}), tmp_path / "resumed", progress=False)
+        train(short("sac", sac={"learning_starts": 100}), tmp_path / "resumed", progress=False)
 
 
 def _without_plans(config):
@@ -97,11 +97,11 @@ def _without_plans(config):
     learner = config.learner
     if learner == "evolution":
         return config
-    options = getattr(config, learner)
+    options = config.settings
     changes = {"final_learning_rate": options.learning_rate}
     if hasattr(options, "lead"):
         changes["lead"] = 1e-9
-    return config.model_copy(update={learner: options.model_copy(update=changes)})
+    return config.model_copy(update={"settings": config.settings.model_copy(update=changes)})
 
 
 @pytest.mark.parametrize("name", QUICK)
@@ -127,7 +127,7 @@ def test_rates_of_an_extended_training_are_those_of_the_new_number_of_steps(tmp_
     learner = AnalyticLearner(longer)
     _restore(learner, tmp_path / CHECKPOINT)
     learner._set_learning_rate()
-    first, last = SHORT.analytic.learning_rate, SHORT.analytic.final_learning_rate
+    first, last = SHORT.settings.learning_rate, SHORT.settings.final_learning_rate
     expected = first + (last - first) * learner.step / 2048
     assert learner.step == 1536 and learner._optimiser.param_groups[0]["lr"] == pytest.approx(expected, rel=1e-9)
     learner.close()
@@ -150,7 +150,7 @@ def test_policy_of_ppo_is_its_mean_action_and_weights_return(tmp_path):
 def test_evolution_finds_linear_policies_that_reach_goals():
     gains = []
     for seed in range(4):  # a single search may get stuck, and rounding, which depends on the processor, decides which
-        updates = {"steps": 16_000, "num_envs": 16, "seed": seed, "evolution": EvolutionConfig()}
+        updates = {"steps": 16_000, "num_envs": 16, "seed": seed, "settings": EvolutionConfig()}
         learner = EvolutionLearner(QUICK["evolution"].model_copy(update=updates))
         first = learner._episode(learner._unpacked(np.zeros((16, 32), dtype=np.float32)), lambda steps: None)
         assert np.ptp(first[0]) == 0.0 and first[1] == 50  # every candidate has the same goal
@@ -208,7 +208,7 @@ def test_a_clone_does_what_the_qp_does():
 
 
 def test_a_memory_is_that_of_torch_and_learns_the_answers_of_the_qp(tmp_path):
-    config = QUICK["recurrent"].model_copy(update={"recurrent": RecurrentConfig(gradient_steps=8, batch_size=8)})
+    config = QUICK["recurrent"].model_copy(update={"settings": RecurrentConfig(gradient_steps=8, batch_size=8)})
     learner = RecurrentLearner(config)
     learner.learn(1, lambda steps: None)
     seen, answers = learner._observations[:1], learner._answers[0]
@@ -243,7 +243,7 @@ def test_training_starts_from_a_policy_of_the_same_widths(trained, tmp_path):
     warm = train(SHORT, tmp_path / "warm", initial=trained, progress=False)
     goals = sample_goals(CONFIG.environment, 20, seed=5)
     assert evaluate(warm, CONFIG.environment, goals).success_rate >= 0.95
-    narrow = SHORT.model_copy(update={"analytic": SHORT.analytic.model_copy(update={"net_arch": [16]})})
+    narrow = SHORT.model_copy(update={"settings": SHORT.settings.model_copy(update={"net_arch": [16]})})
     with pytest.raises(WeightsError, match="same net_arch"):
         train(narrow, tmp_path / "narrow", initial=trained, progress=False)
 
@@ -279,7 +279,7 @@ def test_a_clone_learns_on_any_environment():
     ],
 )
 def test_environments_without_a_model_are_refused(environment, learner, tmp_path):
-    config = TrainConfig.model_validate({**SHORT.model_dump(), "environment": environment, "learner": learner})
+    config = short(learner, environment=environment)
     with pytest.raises(ValueError, match=rf"learner '{learner}' needs environment\.backend = surrogate"):
         train(config, tmp_path / "new", progress=False)
     assert not (tmp_path / "new").exists()

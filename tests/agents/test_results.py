@@ -46,7 +46,7 @@ def test_configurations_fit_their_environment(path):
     assert config.report_every % (config.num_envs * row.max_episode_steps) == 0 or row.backend == "fem"
     assert config.steps % config.report_every == 0
     assert config.environment.sample_design == config.environment.design_in_observation
-    if config.sac.hindsight:
+    if config.learner == "sac" and config.settings.hindsight:
         assert config.environment.task_class.horizon == 1  # hindsight needs a goal that stays
 
 
@@ -135,7 +135,7 @@ def test_a_sweep_writes_results_of_every_seed_and_the_baselines(swept):
 def test_a_finished_sweep_runs_nothing_and_a_lost_result_is_computed_again(swept, monkeypatch):
     place = swept / "out" / "results" / "tiny"
     before = (place / "seed0.json").read_text()
-    monkeypatch.setattr("softgym_envs.agents.training.make_learner", lambda *_: pytest.fail("trained again"))
+    monkeypatch.setattr("softgym_envs.agents.training.LEARNERS", {})  # a training would fail
     assert sweep.sweep([swept / "tiny.yaml"], [0, 3], 1, swept / "out", goals=5, fem_goals=2) == 0
     (place / "seed0.json").unlink()
     assert sweep.sweep([swept / "tiny.yaml"], [0, 3], 1, swept / "out", goals=5, fem_goals=2) == 0

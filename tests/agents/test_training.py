@@ -12,7 +12,7 @@ from safetensors import safe_open
 from softgym_envs.agents import training
 from softgym_envs.agents.config import EnvironmentConfig, TrainConfig
 from softgym_envs.agents.evaluation import evaluate, sample_goals
-from softgym_envs.agents.learners.cloning import CloningLearner
+from softgym_envs.agents.learners.cloning import CloningConfig, CloningLearner
 from softgym_envs.agents.learners.sac import SACLearner
 from softgym_envs.agents.policy import Policy
 from softgym_envs.agents.training import train
@@ -81,7 +81,7 @@ def test_same_seed_same_policy(trained, tmp_path):
 @pytest.mark.parametrize("hindsight", [0.0, 0.8])
 def test_interrupted_training_ends_as_an_uninterrupted_one(hindsight, tmp_path, monkeypatch):
     # 200 steps of 8 environments end in the middle of episodes.
-    config = CONFIG.model_copy(update={"sac": CONFIG.sac.model_copy(update={"hindsight": hindsight})})
+    config = CONFIG.model_copy(update={"settings": CONFIG.settings.model_copy(update={"hindsight": hindsight})})
     uninterrupted = train(config, tmp_path / "uninterrupted", progress=False).read_bytes()
     folder = tmp_path / "interrupted"
     original = SACLearner.learn
@@ -173,7 +173,10 @@ def test_a_training_that_cannot_be_extended_is_refused_and_left_as_it_is(trained
 
 
 LONG = CONFIG.model_copy(
-    update={"steps": 600, "sac": CONFIG.sac.model_copy(update={"final_learning_rate": 1e-3, "hindsight": 0.8})}
+    update={
+        "steps": 600,
+        "settings": CONFIG.settings.model_copy(update={"final_learning_rate": 1e-3, "hindsight": 0.8}),
+    }
 )
 """Its learning rate does not depend on the number of steps."""
 
@@ -208,7 +211,9 @@ def test_an_interrupted_extension_keeps_the_policy_and_ends_as_an_uninterrupted_
 
 
 def test_a_training_that_other_code_continues_says_so(tmp_path, capfd):
-    config = CONFIG.model_copy(update={"learner": "cloning", "steps": 16, "report_every": 8})
+    config = CONFIG.model_copy(
+        update={"learner": "cloning", "settings": CloningConfig(), "steps": 16, "report_every": 8}
+    )
     with interrupted_at(CloningLearner, 8):
         train(config, tmp_path, progress=False)
     path = tmp_path / "provenance.json"
@@ -294,7 +299,7 @@ def test_a_policy_refuses_an_environment_it_was_not_trained_for(name, tmp_path):
     if name == "task":
         return  # a training may start from it
     with pytest.raises(ConfigError, match=message):
-        wide = CONFIG.sac.model_copy(update={"net_arch": [128, 128]})
+        wide = CONFIG.settings.model_copy(update={"net_arch": [128, 128]})
         config = CONFIG.model_copy(update={"environment": environment, "sac": wide})
         train(config, tmp_path / "run", initial="finger_reach_designs", progress=False)
     assert not (tmp_path / "run").exists()
@@ -332,7 +337,10 @@ def test_a_training_starts_from_a_policy_of_another_task_with_goals_of_the_same_
 def test_warm_start_and_early_stop(trained, tmp_path):
     seen = []
     config = CONFIG.model_copy(
-        update={"seed": 5, "sac": CONFIG.sac.model_copy(update={"learning_rate": 1e-12, "final_learning_rate": 1e-12})}
+        update={
+            "seed": 5,
+            "settings": CONFIG.settings.model_copy(update={"learning_rate": 1e-12, "final_learning_rate": 1e-12}),
+        }
     )
 
     def report(step, outcome):
@@ -344,7 +352,7 @@ def test_warm_start_and_early_stop(trained, tmp_path):
     assert json.loads(path.with_suffix(".json").read_text())["stopped_early"] is True
     x = np.random.default_rng(0).uniform(-1, 1, (4, 15)).astype(np.float32)
     assert np.abs(Policy(path)(x) - Policy(trained)(x)).max() < 1e-4
-    wider = CONFIG.model_copy(update={"sac": CONFIG.sac.model_copy(update={"net_arch": [32, 32]})})
+    wider = CONFIG.model_copy(update={"settings": CONFIG.settings.model_copy(update={"net_arch": [32, 32]})})
     with pytest.raises(WeightsError, match="does not fit.*net_arch"):
         train(wider, tmp_path / "wider", initial=trained, progress=False)
 

@@ -260,7 +260,7 @@ def test_shipped_configs_and_their_policies(path):
         seen = card["environment"]["design_in_observation"]  # True: the whole design
         assert seen is True or seen == list(config.variables)
         if config.plan.trains:  # trainings go on from its networks
-            assert getattr(config.training, config.training.learner).net_arch == Policy(config.policy).widths
+            assert config.training.settings.net_arch == Policy(config.policy).widths
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "configs" / "codesign").glob("*.yaml")), ids=lambda path: path.stem)

@@ -12,11 +12,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import Field, field_validator
 
 from softgym_envs.agents.config import TrainConfig
-from softgym_envs.agents.learners.base import Learner, Tensors, check_weights
+from softgym_envs.agents.learners.base import Learner, Tensors, check_layers, check_weights
+from softgym_envs.config import Config
 from softgym_envs.envs.vector_env import SoftRobotVectorEnv
 from softgym_envs.extras import require
+
+
+class EvolutionConfig(Config):
+    """Hyperparameters of the evolution of weights (`softgym_envs.extensions.learners.evolution`)."""
+
+    step_size: float = Field(default=0.2, gt=0, description="first standard deviation of each weight")
+    net_arch: list[int] = Field(default=[], description="widths of hidden layers; none for a linear policy")
+
+    @field_validator("net_arch")
+    @classmethod
+    def _layers(cls, value: list[int]) -> list[int]:
+        return check_layers(value)
 
 
 class EvolutionLearner(Learner):
@@ -35,13 +49,16 @@ class EvolutionLearner(Learner):
         ValueError: for fewer than four sub-environments.
     """
 
+    Config = EvolutionConfig
+    title = "evolution"
+
     def __init__(self, config: TrainConfig) -> None:
         if config.num_envs < 4:
             raise ValueError(f"num_envs = {config.num_envs} is too small for learner 'evolution'; allowed: 4 or more")
         require("codesign")
         super().__init__(config)
         self.env = config.environment.make_vec(config.num_envs)
-        sizes = [self.env.single_observation_space.shape[0], *config.evolution.net_arch]  # type: ignore[index]
+        sizes = [self.env.single_observation_space.shape[0], *config.settings.net_arch]  # type: ignore[index]
         layers = [(f"actor.latent_pi.{2 * k}", a, b) for k, (a, b) in enumerate(zip(sizes, sizes[1:], strict=False))]
         layers.append(("actor.mu", sizes[-1], self.env.single_action_space.shape[0]))  # type: ignore[index]
         self._shapes = {f"{name}.{part}": shape for name, a, b in layers for part, shape in _parts(a, b)}
@@ -57,7 +74,7 @@ class EvolutionLearner(Learner):
         self._returns: list[np.ndarray] = []
         self._lengths: list[int] = []
         self._search = CMA(
-            mean=first, sigma=config.evolution.step_size, population_size=config.num_envs, seed=config.seed
+            mean=first, sigma=config.settings.step_size, population_size=config.num_envs, seed=config.seed
         )
 
     def learn(self, target: int, progress: Callable[[int], object]) -> None:

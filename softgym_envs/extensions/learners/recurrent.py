@@ -12,12 +12,24 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
+from pydantic import Field
 
 from softgym_envs.agents.baselines import make_baseline
 from softgym_envs.agents.config import TrainConfig
 from softgym_envs.agents.learners.base import Tensors
-from softgym_envs.agents.learners.network import NetworkLearner
+from softgym_envs.agents.learners.network import GradientConfig, NetworkLearner
 from softgym_envs.agents.policy import memory_layers, remember
+
+
+class RecurrentConfig(GradientConfig):
+    """Hyperparameters of the imitation by a network with memory (`softgym_envs.extensions.learners.recurrent`)."""
+
+    net_arch: list[int] = Field(default=[64], min_length=1, max_length=1, description="width of the memory")
+    batch_size: int = Field(default=32, gt=0, description="episodes of each update")
+    gradient_steps: int = Field(default=8, gt=0, description="updates after each episode")
+    lead: float = Field(
+        default=0.2, gt=0, le=1, description="share of the steps until the policy acts alone in all episodes"
+    )
 
 
 class RecurrentLearner(NetworkLearner):
@@ -33,10 +45,18 @@ class RecurrentLearner(NetworkLearner):
         ValueError: for several sub-environments, a correction of the QP, or a task whose states the QP needs.
     """
 
+    Config = RecurrentConfig
+    title = "recurrent"
+    model_based = True
+
+    @classmethod
+    def update_seconds(cls, config: TrainConfig) -> float:
+        return 0.005
+
     def __init__(self, config: TrainConfig) -> None:
         import torch
 
-        environment, options = config.environment, config.recurrent
+        environment, options = config.environment, config.settings
         if config.num_envs != 1 or environment.residual_scale or environment.task_class.needs_state:
             raise ValueError(
                 f"learner 'recurrent' needs num_envs = 1, no residual_scale and goals in space, got {config.num_envs}, "
@@ -61,7 +81,7 @@ class RecurrentLearner(NetworkLearner):
         self._episodes = 0
 
     def learn(self, target: int, progress: Callable[[int], object]) -> None:
-        options = self.config.recurrent
+        options = self.config.settings
         rng = np.random.default_rng([self.config.seed, self.step])
         while self.step < target:
             self._set_learning_rate()
