@@ -63,7 +63,7 @@ class InverseQPAgent:
         self._controllers[env] = make_controller(env.robot, env.task)
 
     def _solve(self, env: Any, controller: InverseQP, present: np.ndarray) -> np.ndarray:
-        return controller.solve(env.state.condensed, env.aim, present, env.state.slack)
+        return controller.solve(env.state.condensed, env.observed_goal, present, env.state.slack)
 
 
 class StaticQPAgent(InverseQPAgent):
@@ -73,7 +73,7 @@ class StaticQPAgent(InverseQPAgent):
 
     def _solve(self, env: Any, controller: InverseQP, present: np.ndarray) -> np.ndarray:
         still = env.backend.probe(present) if env.backend.moving else env.state
-        return controller.solve(still.condensed, env.aim, present, still.slack)
+        return controller.solve(still.condensed, env.observed_goal, present, still.slack)
 
 
 class ModelQPAgent(InverseQPAgent):
@@ -107,7 +107,7 @@ class ModelQPAgent(InverseQPAgent):
 
     def _solve(self, env: Any, controller: InverseQP, present: np.ndarray) -> np.ndarray:
         expected = self._predict(env, present)
-        return controller.solve(expected.condensed, env.aim, present, expected.slack)
+        return controller.solve(expected.condensed, env.observed_goal, present, expected.slack)
 
 
 class CorrectedQPAgent(ModelQPAgent):
@@ -129,15 +129,15 @@ class CorrectedQPAgent(ModelQPAgent):
         if env.task.sensors:
             raise ValueError(f"agent 'qp_pi' measures the effector, which task '{env.task.name}' hides")
         self._corrections[env] = PICorrection(*PI_GAINS)
-        self._previous_aims[env] = env.aim
+        self._previous_aims[env] = env.observed_goal
 
     def _solve(self, env: Any, controller: InverseQP, present: np.ndarray) -> np.ndarray:
         expected = self._predict(env, present)
         axes, correction = env.task.axes, self._corrections[env]
         # The effector follows the previous aim; the motion of the aim since then is not an error of the model.
         error = axes * (self._previous_aims[env] - env.sensed.effector)
-        self._previous_aims[env] = env.aim
-        aim = correction.correct(env.aim, env.aim - error)
+        self._previous_aims[env] = env.observed_goal
+        aim = correction.correct(env.observed_goal, env.observed_goal - error)
         command = controller.solve(expected.condensed, aim, present, expected.slack)
         model = expected.condensed
         reached = model.delta.e + model.W.ea @ (controller.effort - model.lambda_.a)

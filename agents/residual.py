@@ -54,7 +54,7 @@ class BatchQP:
     def __call__(self) -> np.ndarray:
         """Return actions for the present states, shape (num_envs, n_a); rows without a solution hold the command."""
         env = self._env
-        commands = self._controller.solve_batch(env.condensed, env.aims, env.command, env.slack)
+        commands = self._controller.solve_batch(env.condensed, env.observed_goals, env.command, env.slack)
         return env.spaces.action(commands, env.command)
 
 

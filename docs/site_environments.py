@@ -174,8 +174,8 @@ def environment_sections(identifier: str) -> dict[str, Callable[[], str]]:
         held = (
             " There is no termination: the goal has to be held." if task.horizon == 1 else " There is no termination."
         )
-        if task_class.lost is not Task.lost:
-            held = f" Termination when the episode is lost: {inspect.cleandoc(task_class.lost.__doc__ or '')}"
+        if task_class.is_failed is not Task.is_failed:
+            held = f" Termination when the task has failed: {inspect.cleandoc(task_class.is_failed.__doc__ or '')}"
         return (
             f"Truncation after {spec.max_episode_steps} steps.{held} If no equilibrium is found the episode is "
             'truncated with `info["converged"] = False` and a reward of 0.'
@@ -187,7 +187,7 @@ def environment_sections(identifier: str) -> dict[str, Callable[[], str]]:
         return (
             f"`effector` [m], `goal` [{goal_unit}], `measured` [{goal_unit}] (what is compared with the goal), "
             f"`distance` ({error.strip()}), `is_success` (`distance` < "
-            f"{limit}), `lost`, `reward_*` (the terms of the reward), `displacement` [{unit}], `effort` "
+            f"{limit}), `is_failed`, `reward_*` (the terms of the reward), `displacement` [{unit}], `effort` "
             f"[{force_unit}], `stable` (FEM: the tangent is positive definite), `converged`. `env.unwrapped.state` is "
             "the whole mechanical state, with the condensed model at `env.unwrapped.state.condensed` (`W.ea`, "
             "`delta_free.e`, ...)."

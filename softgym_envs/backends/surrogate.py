@@ -323,7 +323,7 @@ class SurrogateBackend(Backend):
                 "backend='fem', or its learned model as part of a gripper"
             )
         self.robot = robot
-        learned = robot.under_touch()
+        learned = robot.touch_variant()
         self.takes_touch = learned is not robot
         self.model = standalone_model(learned, weights, members)
         self._touch: PointForce | None = None

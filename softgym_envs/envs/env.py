@@ -140,7 +140,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         self._sensed: Sensed | None = None
         self._renderer: Any = None
         self._path = np.zeros((1, 3))
-        self._show(self._fixed_design)
+        self._observe_design(self._fixed_design)
         self._step = 0
 
     @property
@@ -163,7 +163,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         """What the sensors show of the present state."""
         state = self.state
         return self._sensed or Sensed(
-            state.displacement, state.effort, self.task.measure(state), self.task.sense(state)
+            state.displacement, state.effort, self.task.measure(state), self.task.sensor_readings(state)
         )
 
     @property
@@ -172,7 +172,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         return self._goal_at(self._step)
 
     @property
-    def aim(self) -> np.ndarray:
+    def observed_goal(self) -> np.ndarray:
         """The goal that the observation shows, ``task.lookahead`` steps ahead of `goal`, shape (3,)."""
         return self._goal_at(self._step + self.task.lookahead)
 
@@ -213,7 +213,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             design = self._fixed_design if given is None else self.design_space.complete(given, self._fixed_design)
             self.backend.reset(design)
         self._begin_plant()
-        self._show(design)
+        self._observe_design(design)
         if path is None:
             path = check_drawn(self.task, self.task.sample(self.np_random, 1, self._kinematics), 1)[0]
         self._path = path
@@ -234,7 +234,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         self.backend.cable_friction = self.plant.cable_friction
         self.backend.cable_compliance = self.plant.cable_compliance
 
-    def _show(self, design: Design) -> None:
+    def _observe_design(self, design: Design) -> None:
         self._unit_design = self.design_space.observe(design.array, self.spaces.design_names)
 
     def get_state(self) -> EpisodeState:
@@ -279,7 +279,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         self.backend.cable_compliance = state.plant.cable_compliance
         self.backend.resume(state.physics)
         self.plant, self._sent, self._sensed = state.plant, state.sent.copy(), state.sensed
-        self._show(self.backend.design)
+        self._observe_design(self.backend.design)
         vars(self.task).update(copy.deepcopy(state.progress))
         self._path, self._step = state.path.copy(), state.step
         if state.random is not None:
@@ -320,7 +320,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         """Apply one action, shape (n_a,) in [-1, 1]; values outside are clipped.
 
         A step whose equilibrium is not found ends the episode (truncated) with ``info["converged"] = False``. An
-        episode that the task has lost ends too (terminated), with ``info["lost"] = True``.
+        episode whose task has failed ends too (terminated), with ``info["is_failed"] = True``.
 
         Raises:
             ValueError: for an action with a wrong shape or a value that is not finite.
@@ -345,13 +345,13 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         if self.render_mode == "human":
             self.render()
         observation, reward, info = self._observe(converged)
-        return observation, reward, bool(info["lost"]), not converged, info
+        return observation, reward, bool(info["is_failed"]), not converged, info
 
     def _observe(self, converged: bool = True, *, sense: bool = True) -> tuple[np.ndarray, float, dict[str, Any]]:
         """Return observation, reward and info of the present state; with ``sense``, the sensors are read anew."""
         state, goal = self.state, self.goal
         measured = self.task.measure(state)
-        true = Sensed(state.displacement, state.effort, measured, self.task.sense(state))
+        true = Sensed(state.displacement, state.effort, measured, self.task.sensor_readings(state))
         if sense and self.plant.noise:
             self._sensed = sensed(self.robot, true, self.plant.noise, self.np_random, self.task.measured_scale)
         distance, terms, _ = self.task.rate(measured, goal, self.spaces.effort_share(state.effort))
@@ -362,7 +362,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             "goal": goal.copy(),
             "distance": distance,
             "is_success": distance < self.task.success_distance,
-            "lost": self.task.lost(state),
+            "is_failed": self.task.is_failed(state),
             **{f"reward_{name}": term for name, term in terms.items()},
             "converged": converged,
             **_mechanics(state),
@@ -378,7 +378,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             shown.displacement,
             shown.effort,
             shown.effector,
-            self.aim,
+            self.observed_goal,
             self._unit_design,
             velocity,
             sensors,
@@ -388,8 +388,8 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
     def _sensor_values(self, readings: np.ndarray, new: bool) -> np.ndarray:
         """Return the sensor values of an observation for readings in [-1, 1] (s,): these, touch, earlier readings."""
         command = (self.command - self.spaces.middle) / self.spaces.half_range
-        earlier = self.task.recall(np.concatenate([command, readings]), new)
-        return np.concatenate([readings, self.task.feel(), earlier])
+        earlier = self.task.past_readings(np.concatenate([command, readings]), new)
+        return np.concatenate([readings, self.task.touch_readings(), earlier])
 
     def _kinematics(self, commands: np.ndarray) -> np.ndarray:
         """Return the effectors [m] (1, 3) that commands (1, n_a) lead to; NaN without an equilibrium."""

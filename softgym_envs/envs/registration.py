@@ -80,7 +80,7 @@ def environment_row(
     return EnvironmentRow(robot, task, max_episode_steps, backend, **options)
 
 
-MOVING = {"dynamics": True}
+DYNAMIC = {"dynamics": True}
 
 ENVIRONMENTS: dict[str, EnvironmentRow] = {
     "SoftGym/FingerReach-v0": environment_row("finger", "reach", 50),
@@ -95,9 +95,9 @@ ENVIRONMENTS: dict[str, EnvironmentRow] = {
     "SoftGym/FingerPress-v0": environment_row("press_finger", "track", 100),
     "SoftGym/GripperPinch-v0": environment_row("two_finger_gripper", "track", 100),
     "SoftGym/GripperManipulate-v0": environment_row("three_finger_gripper", "track", 100),
-    "SoftGym/TetrapodReach-v0": environment_row("tetrapod", "reach", 100, backend="fem", backend_options=MOVING),
-    "SoftGym/TetrapodTrack-v0": environment_row("tetrapod", "track", 100, backend="fem", backend_options=MOVING),
-    "SoftGym/TetrapodCarry-v0": environment_row("tetrapod", "carry", 100, backend="fem", backend_options=MOVING),
+    "SoftGym/TetrapodReach-v0": environment_row("tetrapod", "reach", 100, backend="fem", backend_options=DYNAMIC),
+    "SoftGym/TetrapodTrack-v0": environment_row("tetrapod", "track", 100, backend="fem", backend_options=DYNAMIC),
+    "SoftGym/TetrapodCarry-v0": environment_row("tetrapod", "carry", 100, backend="fem", backend_options=DYNAMIC),
 }
 """All environments of a robot with a task, by ID; `register_environment` and installed packages add to them."""
 

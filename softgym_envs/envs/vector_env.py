@@ -218,7 +218,7 @@ class SoftRobotVectorEnv(VectorEnv):
         return self.task.goals(self._paths, self._counts, self._steps)
 
     @property
-    def aims(self) -> np.ndarray:
+    def observed_goals(self) -> np.ndarray:
         """Goals that the observations show, ``task.lookahead`` steps ahead of `goals`, shape (num_envs, 3)."""
         return self.task.goals(self._paths, self._counts, self._steps + self.task.lookahead)
 
@@ -386,7 +386,7 @@ class SoftRobotVectorEnv(VectorEnv):
             shown.displacement,
             shown.effort,
             shown.effector,
-            self.aims,
+            self.observed_goals,
             self._unit_design,
             self.backend.velocity,
         )

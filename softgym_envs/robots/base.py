@@ -201,12 +201,12 @@ class Robot(ABC):
         """Design variables that say what acts on the body, not what the body is."""
         return ()
 
-    def under_touch(self) -> Robot:
+    def touch_variant(self) -> Robot:
         """Return the robot whose design also says what touches it, as it is learned; itself if no touch is learned."""
         return self
 
     def touch_design(self, design: Mapping[str, float], point: np.ndarray, force: np.ndarray) -> dict[str, float]:
-        """Return the `load_variables` of `under_touch` for a force [N] (3,) at a point [m] (3,) of a complete design.
+        """Return the `load_variables` of `touch_variant` for a force [N] (3,) at a point [m] (3,) of a complete design.
 
         Raises:
             ValueError: for a touch that is not learned.
@@ -457,18 +457,18 @@ class MeshedRobot(Robot):
 
     @abstractmethod
     def mesh(self, design: Mapping[str, float]) -> BodyMesh:
-        """Return a new or cached mesh of a complete design: the whole body, or the part that `unfold` completes."""
+        """Return a new or cached mesh of a complete design: the whole body, or the part that `mirror` completes."""
 
     @abstractmethod
     def features(self, design: Mapping[str, float]) -> dict[str, Feature]:
         """Return the planes, cylinders and cones on which the surface of a mesh from `mesh` lies, by name."""
 
-    def unfold(self, part: BodyMesh) -> BodyMesh:
+    def mirror(self, part: BodyMesh) -> BodyMesh:
         """Return the whole body. A symmetric robot meshes a part of it and mirrors that part here."""
         return part
 
     @abstractmethod
-    def equip(self, mesh: BodyMesh, design: Mapping[str, float]) -> MechanicalModel:
+    def build_model(self, mesh: BodyMesh, design: Mapping[str, float]) -> MechanicalModel:
         """Return the model of a meshed body: material, boundary conditions, actuators, effectors, contacts."""
 
     @property
@@ -476,14 +476,14 @@ class MeshedRobot(Robot):
         """The design whose mesh is moved to all others: the baseline, or one nearer the centre of the design space."""
         return self.design_space.baseline
 
-    def guess(self, nodes: np.ndarray, design: Mapping[str, float]) -> np.ndarray:
+    def initial_motion(self, nodes: np.ndarray, design: Mapping[str, float]) -> np.ndarray:
         """Return rough displacements [m] (n, 3) of the reference nodes, from which the mesh motion starts."""
         return np.zeros_like(nodes)
 
     # -- what follows from it ---------------------------------------------------------------------------------------
 
     def assemble(self, design: Mapping[str, float]) -> MechanicalModel:
-        return self.equip(self.body(design), design)
+        return self.build_model(self.body(design), design)
 
     def body(self, design: Mapping[str, float] | None = None) -> BodyMesh:
         """Return the mesh of a design: the reference mesh moved, or a new one when its quality falls too low.
@@ -494,15 +494,15 @@ class MeshedRobot(Robot):
         """
         complete = self.design_space.complete(design)
         if self.meshing == "remesh":
-            return self.unfold(self.mesh(complete))
+            return self.mirror(self.mesh(complete))
         if self._morpher is None:
             reference = self.reference_design
             self._morpher = Morpher(self.mesh(reference), self.features(reference))
         base = self._morpher.mesh
-        nodes = self._morpher.move(self.features(complete), self.guess(base.nodes, complete))
+        nodes = self._morpher.move(self.features(complete), self.initial_motion(base.nodes, complete))
         if self._morpher.quality(nodes) >= self.quality_bound:
-            return self.unfold(replace(base, nodes=nodes, origin="morphed"))
-        return self.unfold(replace(self.mesh(complete), origin="remeshed"))
+            return self.mirror(replace(base, nodes=nodes, origin="morphed"))
+        return self.mirror(replace(self.mesh(complete), origin="remeshed"))
 
     def solid(
         self, mesh: BodyMesh, design: Mapping[str, float], *, fixed: np.ndarray, density: float = 1100.0
@@ -534,7 +534,7 @@ class MeshedRobot(Robot):
         """
         if mesh.origin != "morphed" or self._morpher is None:
             return mesh.nodes
-        return self.unfold(self._morpher.mesh).nodes
+        return self.mirror(self._morpher.mesh).nodes
 
     def reference_element(self, mesh: BodyMesh, point: np.ndarray) -> np.ndarray | None:
         """Element nearest to a point [m] (3,) of the reference body, as a hint for points outside a moved mesh.
@@ -544,5 +544,5 @@ class MeshedRobot(Robot):
         """
         if mesh.origin != "morphed" or self._morpher is None:
             return None
-        base = self.unfold(self._morpher.mesh)
+        base = self.mirror(self._morpher.mesh)
         return EmbeddedPoints(point, base.nodes, base.tetrahedra).elements

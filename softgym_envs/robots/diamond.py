@@ -189,13 +189,13 @@ class Diamond(MeshedRobot):
             features[name] = Plane((x, y, 0), (dy, -dx, 0))
         return features
 
-    def unfold(self, part: BodyMesh) -> BodyMesh:
+    def mirror(self, part: BodyMesh) -> BodyMesh:
         """Mirror the eighth to a quarter, a half and the whole."""
         for normal in ((1, -1, 0), (0, 1, 0), (1, 0, 0)):
             part = mirrored(part, normal)
         return part
 
-    def guess(self, nodes: np.ndarray, design: Mapping[str, float]) -> np.ndarray:
+    def initial_motion(self, nodes: np.ndarray, design: Mapping[str, float]) -> np.ndarray:
         """Return displacements that stretch the legs with the elbow, and the upper half with the top."""
         base, mm = self.reference_design, 1e-3
         x, y, z = nodes.T
@@ -214,7 +214,7 @@ class Diamond(MeshedRobot):
 
     # -- mechanics --------------------------------------------------------------------------------------------------
 
-    def equip(self, mesh: BodyMesh, design: Mapping[str, float]) -> MechanicalModel:
+    def build_model(self, mesh: BodyMesh, design: Mapping[str, float]) -> MechanicalModel:
         """Clamp the middle of the base, tie a cable to each elbow, put the effector just below the top."""
         # Chosen by the reference positions: the same nodes are clamped however far the mesh has moved.
         nodes = self.reference_nodes(mesh)

@@ -185,12 +185,12 @@ class SoftFinger(MeshedRobot):
         return self.design_space.complete(self._middle) if is_half(self.tier) else super().reference_design
 
     def mesh(self, design: Mapping[str, float]) -> BodyMesh:
-        """Mesh the body of a complete design, or the half that `unfold` completes."""
+        """Mesh the body of a complete design, or the half that `mirror` completes."""
         lengths = self.lengths(design)
         check_finger(lengths)
         return mesh_finger(lengths, self.tier, self.loaded_parts(design).tolist())
 
-    def unfold(self, part: BodyMesh) -> BodyMesh:
+    def mirror(self, part: BodyMesh) -> BodyMesh:
         """Complete the body of a graded mesh."""
         return whole_finger(part, self.tier)
 
@@ -227,13 +227,13 @@ class SoftFinger(MeshedRobot):
         balls = np.column_stack([guides, np.full(len(guides), self.guide_radius)])
         return np.vstack([balls[guides[:, 0] >= 0.0], contact])
 
-    def guess(self, nodes: np.ndarray, design: Mapping[str, float]) -> np.ndarray:
+    def initial_motion(self, nodes: np.ndarray, design: Mapping[str, float]) -> np.ndarray:
         """Return displacements that stretch the body along z with the segment length."""
         displacement = np.zeros_like(nodes)
         displacement[:, 2] = nodes[:, 2] * (design["length"] / self.reference_design["length"] - 1.0)
         return displacement
 
-    def equip(self, mesh: BodyMesh, design: Mapping[str, float]) -> MechanicalModel:
+    def build_model(self, mesh: BodyMesh, design: Mapping[str, float]) -> MechanicalModel:
         """Clamp the flange, route the cables past the notches, put the effector at the middle of the tip."""
         model = self.solid(mesh, design, fixed=in_flange(mesh.nodes))
         for actuator, (pull_point, points) in zip(self.actuators, self.routes(design), strict=True):

@@ -142,7 +142,7 @@ def test_bounds_time_limit_and_info(identifier, options, episodes, action_mode):
             observation, reward, terminated, truncated, info = env.step(env.action_space.sample())
             steps += 1
             assert env.observation_space.contains(observation)
-            assert terminated == info["lost"]
+            assert terminated == info["is_failed"]
             assert 0.0 <= reward <= 1.0
             assert (np.abs(env.unwrapped.state.command - before) <= env.unwrapped.robot.rates + 1e-15).all()
         assert steps == limit or terminated
@@ -162,7 +162,7 @@ def test_bounds_time_limit_and_info(identifier, options, episodes, action_mode):
 
 def check_info(info):
     """TorchRL reads the dtype of every value; Gymnasium batches booleans only if they are arrays."""
-    flags = ("is_success", "lost", "stable", "trusted", "converged")
+    flags = ("is_success", "is_failed", "stable", "trusted", "converged")
     assert {name for name, value in info.items() if value.dtype == bool} == set(flags)
     assert info["distrust"].dtype == np.int64
     whole = ("distrust", "plant_delay")

@@ -126,7 +126,7 @@ def test_bodies_at_the_corners_and_inside_of_the_design_box(robot, rng):
         origins.append(mesh.origin)
         # The morphed body is kept only where its elements are not much worse than the baseline's.
         assert quality > 0.05, design
-        model = robot.equip(mesh, robot.design_space.complete(design))
+        model = robot.build_model(mesh, robot.design_space.complete(design))
         assert model.energy(model.nodes) == pytest.approx(0.0, abs=1e-12)
         for cable in model.constraints["a"]:
             # Cable points are in the body, or on its surface to round-off.
@@ -145,7 +145,7 @@ def test_effectors_outside_the_body_are_tied_to_one_element(robot, rng):
     for _ in range(8):
         design = robot.design_space.sample(rng)
         mesh = robot.body(design)
-        (effector,) = robot.equip(mesh, design).constraints["e"]
+        (effector,) = robot.build_model(mesh, design).constraints["e"]
         if mesh.origin == "morphed" and effector.embedding.weights.min() < -1e-9:
             np.testing.assert_array_equal(effector.embedding.elements, base.embedding.elements)
             assert np.abs(effector.embedding.weights - base.embedding.weights).max() < 0.5
@@ -154,7 +154,7 @@ def test_effectors_outside_the_body_are_tied_to_one_element(robot, rng):
 def test_the_reference_body_is_the_unmoved_mesh(robot):
     mesh = robot.body(robot.reference_design)
     assert mesh.origin == "morphed"
-    np.testing.assert_allclose(mesh.nodes, robot.unfold(robot.mesh(robot.reference_design)).nodes, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(mesh.nodes, robot.mirror(robot.mesh(robot.reference_design)).nodes, rtol=0, atol=1e-12)
 
 
 def test_the_same_design_gives_the_same_body_bit_for_bit(robot):

@@ -244,15 +244,15 @@ class Task(ABC):
         """Return the force that touches the body during a control step, or None."""
         return None
 
-    def sense(self, state: State) -> np.ndarray:
+    def sensor_readings(self, state: State) -> np.ndarray:
         """Return the readings of the sensors over their scale, without noise, shape (s,); s is at most ``sensors``."""
         return np.zeros(0)
 
-    def feel(self) -> np.ndarray:
+    def touch_readings(self) -> np.ndarray:
         """Return what the touch sensors show of the last `touch`, in [-1, 1], shape (t,)."""
         return np.zeros(0)
 
-    def recall(self, reading: np.ndarray, new: bool) -> np.ndarray:
+    def past_readings(self, reading: np.ndarray, new: bool) -> np.ndarray:
         """Return earlier readings that observations show besides the present one, shape (``sensors`` - s - t,).
 
         Args:
@@ -288,8 +288,8 @@ class Task(ABC):
             raise ValueError(f"task '{self.name}' needs contacts, but robot '{self.robot.name}' touches nothing")
         return state.contacts.total
 
-    def lost(self, state: State) -> bool:
-        """Whether the goal is out of reach for good, which terminates the episode; never by default."""
+    def is_failed(self, state: State) -> bool:
+        """Whether the goal can no longer be reached, which terminates the episode; never by default."""
         return False
 
     def state_terms(self, state: State) -> dict[str, float]:

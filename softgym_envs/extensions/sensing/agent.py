@@ -47,5 +47,5 @@ class EstimatedQPAgent(InverseQPAgent):
         if load != estimator.load:
             estimator.touch(load)
         found = estimator.update(estimator.reading(present, env.sensed.sensors * env.robot.sensor_scale))
-        aim = env.aim + found.condensed.delta.e[:3] - found.effector[:3]
+        aim = env.observed_goal + found.condensed.delta.e[:3] - found.effector[:3]
         return controller.solve(found.condensed, aim, present, found.slack)

@@ -1,6 +1,6 @@
 """Estimation of a touch on a learned model, which evaluates every place of a cell at once.
 
-The model has force and place of a touch among its inputs (`Robot.under_touch`). So the equilibrium at each place and
+The model has force and place of a touch among its inputs (`Robot.touch_variant`). So the equilibrium at each place and
 force is its own, not extrapolated from another place: at each place, Gauss-Newton finds the most probable errors of the
 actuators and force. The answer to the actuators is the learned ``W``; the answer to the force is the change of the
 model under held actuators, after which ``W`` puts slack ones back to no effort. The sum over places is that of
@@ -132,7 +132,7 @@ class LearnedEstimator:
         design: missing variables take their baseline.
         load: the touch; None while nothing is touched.
         noise: of sensors and actuators; loads do not drift, and efforts are not read.
-        model: the learned model of ``robot.under_touch()``; default the shipped one.
+        model: the learned model of ``robot.touch_variant()``; default the shipped one.
         exact: whether the body is the learned model itself, so that its errors do not count.
         errors: of the model on this body, from `measured_errors`, for effectors and then sensors; default those on the
             many bodies that the weights were validated on.
@@ -167,9 +167,9 @@ class LearnedEstimator:
         self.steps, self.accuracy = steps, accuracy
         if self.noise.drift or self.noise.effort is not None:
             raise ValueError(f"the estimator on a learned model supports neither drift nor efforts, got {self.noise}")
-        if robot.under_touch() is robot:
+        if robot.touch_variant() is robot:
             raise ValueError(f"no touch of robot '{robot.name}' is learned; use Estimator")
-        self.model = model or pretrained_model(robot.under_touch())
+        self.model = model or pretrained_model(robot.touch_variant())
         self.design = robot.design_space.complete(design)
         space = self.model.robot.design_space
         self._body = np.array([{**space.baseline, **self.design}[name] for name in space.names])

@@ -78,17 +78,17 @@ class SensedReach(Reach):
         self.touched = self.grid.cell(self._load.point)
         return self._load
 
-    def sense(self, state: State) -> np.ndarray:
+    def sensor_readings(self, state: State) -> np.ndarray:
         """Return the changes of the cavities' volumes, or their pressures, over their scale, shape (s,)."""
         return state.condensed.delta.s / self.robot.sensor_scale
 
-    def feel(self) -> np.ndarray:
+    def touch_readings(self) -> np.ndarray:
         """Return whether a cell is touched (1 or -1), and its place along both axes of the grid (-1 to 1, or 0)."""
         if self.touched is None:
             return np.array([-1.0, 0.0, 0.0])
         return np.array([1.0, *(2.0 * (np.array(self.touched) + 0.5) / np.array(self.grid.cells) - 1.0)])
 
-    def recall(self, reading: np.ndarray, new: bool) -> np.ndarray:
+    def past_readings(self, reading: np.ndarray, new: bool) -> np.ndarray:
         """Return the commands and cavities of the readings before the present one, shape ((history - 1) (n_a + s),)."""
         if new:
             known = [reading, *self._readings]

@@ -185,7 +185,7 @@ class SensorizedFinger(MeshedRobot):
     def load_variables(self) -> tuple[str, ...]:
         return ("touch_force", "touch_below", "touch_beside") if self.touch else ()
 
-    def under_touch(self) -> SensorizedFinger:
+    def touch_variant(self) -> SensorizedFinger:
         if self.touch:
             return self
         # A network is smooth in the design, so it learns a mesh that moves with it. At the baseline both are one.
@@ -239,14 +239,14 @@ class SensorizedFinger(MeshedRobot):
         return design["outer_radius"] + self.cable_clearance
 
     def mesh(self, design: Mapping[str, float]) -> BodyMesh:
-        """Mesh the body of a complete design, or the half that `unfold` completes.
+        """Mesh the body of a complete design, or the half that `mirror` completes.
 
         Raises:
             InfeasibleDesign: if the shape cannot exist or cannot be meshed in time.
         """
         lengths = self._checked(design)
         mesh = mesh_finger(lengths, self.tier)
-        found = len(self.unfold(mesh).cavities())
+        found = len(self.mirror(mesh).cavities())
         if found != self.cavities:
             raise InfeasibleDesign(f"the mesh has {found} closed cavities, expected {self.cavities}, for {lengths}")
         return mesh
@@ -255,11 +255,11 @@ class SensorizedFinger(MeshedRobot):
         """Return the surfaces of the shape of a complete design."""
         return graded_features(self.lengths(design), self.tier)
 
-    def unfold(self, part: BodyMesh) -> BodyMesh:
+    def mirror(self, part: BodyMesh) -> BodyMesh:
         """Complete the body of a graded mesh."""
         return whole_finger(part, self.tier)
 
-    def equip(self, mesh: BodyMesh, design: Mapping[str, float]) -> MechanicalModel:
+    def build_model(self, mesh: BodyMesh, design: Mapping[str, float]) -> MechanicalModel:
         """Clamp the flange, route the cable past the notches, put the effector at the tip, make cavities sensors."""
         model = self.solid(mesh, design, fixed=in_flange(mesh.nodes))
         length = LENGTH * 1e-3

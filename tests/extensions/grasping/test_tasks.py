@@ -96,8 +96,8 @@ def test_each_backend_has_its_own_mesh():
 def test_a_box_that_is_left_behind_ends_the_episode(backend):
     env = lift(backend, design={"friction": 0.1, "object_mass": 0.5})
     infos = episode(env, make_baseline("close"), 30, seed=0, options={"goal": (0.0, 0.0, 0.035)})
-    assert len(infos) < 30 and infos[-1]["lost"] and infos[-1]["converged"] and not infos[-1]["is_success"]
-    assert not any(info["lost"] for info in infos[:-1])
+    assert len(infos) < 30 and infos[-1]["is_failed"] and infos[-1]["converged"] and not infos[-1]["is_success"]
+    assert not any(info["is_failed"] for info in infos[:-1])
 
 
 @BACKENDS
@@ -114,17 +114,20 @@ def test_a_box_that_is_dropped_ends_the_episode(backend):
     dropped: list[bool] = []
     infos = episode(env, drop, 30, seed=0, options={"goal": (0.0, 0.0, 0.033)})
     assert (
-        dropped and len(infos) < 30 and infos[-1]["lost"] and infos[-1]["reward_hold"] == pytest.approx(0.8, abs=0.01)
+        dropped
+        and len(infos) < 30
+        and infos[-1]["is_failed"]
+        and infos[-1]["reward_hold"] == pytest.approx(0.8, abs=0.01)
     )
     env.reset()
-    assert not env.step(np.zeros(3, dtype=np.float32))[4]["lost"]  # the next episode begins anew
+    assert not env.step(np.zeros(3, dtype=np.float32))[4]["is_failed"]  # the next episode begins anew
 
 
 @BACKENDS
 def test_force_control_lifts_the_box_and_holds_it(backend):
     env = lift(backend)
     infos = episode(env, make_baseline("force"), 30, seed=0, options={"goal": (0.0, 0.0, 0.033)})
-    assert len(infos) == 30 and not infos[-1]["lost"]
+    assert len(infos) == 30 and not infos[-1]["is_failed"]
     assert infos[-1]["is_success"] and infos[-1]["reward_hold"] == 1.0
     assert infos[0]["reward_hold"] == pytest.approx(0.8)
 

@@ -82,7 +82,7 @@ def test_noise_reaches_the_volumes():
     errors = []
     for _ in range(100):
         env.step(np.zeros(1))
-        true = env.unwrapped.task.sense(env.unwrapped.state)
+        true = env.unwrapped.task.sensor_readings(env.unwrapped.state)
         errors.append(env.unwrapped.sensed.sensors - true)
     assert 0.008 < np.std(errors) < 0.012
 

@@ -30,9 +30,9 @@ class MarkedFinger(ContactAidedFinger):
         self._chain = FingerChain(self)
         self.effectors = ("tip", *(f"marker {k + 1}" for k in range(len(self._chain.marker_nodes))))
 
-    def equip(self, mesh: BodyMesh, design: Mapping[str, float]) -> MechanicalModel:
+    def build_model(self, mesh: BodyMesh, design: Mapping[str, float]) -> MechanicalModel:
         """Return the model of the finger with the markers as further effectors."""
-        model = super().equip(mesh, design)
+        model = super().build_model(mesh, design)
         values = np.array([[design[name] for name in self.design_space.names]])
         places = self._chain.bodies(values).markers[0]
         heights = self.thickness * np.array(HEIGHTS)

@@ -196,7 +196,7 @@ class ContactAidedFinger(MeshedRobot):
 
     # -- mechanics --------------------------------------------------------------------------------------------------
 
-    def equip(self, mesh: BodyMesh, design: Mapping[str, float]) -> MechanicalModel:
+    def build_model(self, mesh: BodyMesh, design: Mapping[str, float]) -> MechanicalModel:
         """Hold the right foot, put the left one on the servo; the effector is the middle of the tip."""
         assembly = ModelBuilder(gravity=self.gravity)
         frame = self.add_to(assembly, mesh, design)

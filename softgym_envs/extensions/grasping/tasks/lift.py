@@ -58,7 +58,7 @@ class Lift(Task):
         # Other coordinates than z are those of all goals.
         return np.where(self.axes > 0.0, measured, self.robot.effector_rest), (height >= low) & (height <= high)
 
-    def lost(self, state: State) -> bool:
+    def is_failed(self, state: State) -> bool:
         """Whether the object was dropped or left behind; states must come in the order of the episode."""
         height = float(state.effector[0, 2] - self.robot.effector_rest[2])
         self._raised |= height > self.lost_height
