@@ -25,7 +25,7 @@ from softgym_envs.mechanics.elements.gas import EnclosedGas
 from softgym_envs.mechanics.elements.quadratic import QuadraticTetrahedra, quadratic_triangles
 from softgym_envs.mechanics.elements.tetrahedra import SolidBlock, check_nodes
 from softgym_envs.mechanics.frames import Frames
-from softgym_envs.mechanics.io import read_mesh
+from softgym_envs.mechanics.io import UNITS, read_mesh, read_surface, unit_factor
 from softgym_envs.mechanics.kinematics import Kinematics
 from softgym_envs.mechanics.loads import Load, spread
 from softgym_envs.mechanics.materials import Material
@@ -33,6 +33,7 @@ from softgym_envs.mechanics.mesh_checks import check_held
 from softgym_envs.mechanics.rods import Rod
 from softgym_envs.mechanics.skins import Skin
 from softgym_envs.mechanics.solids import (
+    DEFAULT_ELEMENT,
     Fixed,
     PerElement,
     are_rows,
@@ -44,12 +45,11 @@ from softgym_envs.mechanics.solids import (
     nodes_in_box,
     solid_part,
 )
-from softgym_envs.mechanics.surfaces import cavity_around
+from softgym_envs.mechanics.surfaces import cavity_around, cavity_like
 from softgym_envs.mechanics.warping import Warping
 from softgym_envs.quantities import check_quantity
 
 announce_compilation()
-
 
 
 class MechanicalModel:
@@ -206,7 +206,7 @@ class MechanicalModel:
         cls,
         path: str | Path,
         *,
-        fixed: Fixed | None = None,
+        fixed: Fixed | str | Sequence[str] | None = None,
         fixed_box: Sequence[float] | None = None,
         scale: float | None = None,
         unit: str | None = None,
@@ -217,13 +217,13 @@ class MechanicalModel:
         """Make a model from a file: a tetrahedral mesh, or a closed surface (STL) that gmsh fills with tetrahedra.
 
         Args:
-            path: any file meshio reads.
-            fixed: clamped nodes, as for `from_mesh`; or
+            path: a mesh, a closed surface or a STEP file, see `read_mesh`.
+            fixed: clamped nodes, as for `from_mesh`, or names of groups of the file; or
             fixed_box: nodes inside (xmin, xmax, ymin, ymax, zmin, zmax) [m] are clamped.
             scale: factor from the file's unit to metres, default 1.
             unit: unit of the file instead of ``scale``: ``"m"``, ``"cm"``, ``"mm"`` or ``"in"``.
-            mesh_size: edge length [m] for filling a surface; default: a twentieth of its diagonal.
-            time_limit: time limit for meshing a surface [s].
+            mesh_size: edge length [m] for filling a surface or shape; default: a twentieth of its diagonal.
+            time_limit: time limit for meshing a surface or shape [s].
             **options: as for `from_mesh`.
 
         Raises:
@@ -235,10 +235,10 @@ class MechanicalModel:
         check_size(mesh.nodes, "for a file in millimetres pass unit='mm', for one in metres unit='m'")
         if (fixed is None) == (fixed_box is None):
             raise ValueError("pass the clamped nodes as either 'fixed' or 'fixed_box'")
-        if fixed_box is not None:
-            fixed = nodes_in_box(mesh.nodes, fixed_box)
-        assert fixed is not None
-        return cls.from_mesh(mesh.nodes, mesh.tetrahedra, fixed=fixed, regions=mesh.regions, **options)
+        if options.get("element", DEFAULT_ELEMENT) != "quadratic":
+            mesh = mesh.corners_only()
+        clamped = mesh.named(fixed) if fixed_box is None else nodes_in_box(mesh.nodes, fixed_box)
+        return cls.from_mesh(mesh.nodes, mesh.tetrahedra, fixed=clamped, regions=mesh.regions, **options)
 
     @property
     def solids(self) -> list[SolidBlock]:
@@ -337,20 +337,25 @@ class MechanicalModel:
         self,
         name: str,
         *,
-        surface: np.ndarray | None = None,
+        surface: np.ndarray | str | Path | None = None,
         inside: Sequence[float] | np.ndarray | None = None,
+        unit: str | None = None,
         block: int = 0,
     ) -> Cavity:
         """Add a pneumatic actuator: a closed cavity of a solid, whose pressure follows the surface.
 
         Args:
             name: identifier.
-            surface: triangles of corner nodes, shape (k, 3); quadratic elements add their midside nodes. Or
+            surface: triangles of corner nodes, shape (k, 3); quadratic elements add their midside nodes. Or a file with
+                the surface of the chamber, as scenes of SOFA have it: the cavity that it fills is then found. Or
             inside: a point [m] (3,) within the cavity, whose surface is then found.
+            unit: unit of the file, see `read_mesh`; by default the one in which it fills a cavity.
             block: number of the solid among `solids`.
 
         Raises:
-            ValueError: if no closed cavity encloses the point, or the surface is not closed.
+            DataError: if the file cannot be read.
+            ValueError: if no closed cavity encloses the point or is filled by the file's surface, or the surface is not
+                closed.
         """
         if (surface is None) == (inside is None):
             raise ValueError(f"cavity '{name}' needs either its 'surface' or a point 'inside' it")
@@ -358,6 +363,10 @@ class MechanicalModel:
         if surface is None:
             check_distance(np.asarray(inside), self._solid_nodes, f"the point inside cavity '{name}'", 1.0)
             triangles = cavity_around(self.nodes, solid.corners, np.asarray(inside), name)
+        elif isinstance(surface, str | Path):
+            points, faces, in_metres = read_surface(surface)
+            factors = [1.0] if in_metres else [unit_factor(None, unit)] if unit else list(UNITS.values())
+            triangles = cavity_like(self.nodes, solid.corners, [(f * points, faces) for f in factors], name)
         else:
             triangles = np.asarray(surface)
         cavity = self.cavity(name, triangles, block=block)

@@ -23,6 +23,9 @@ SOLIDS: dict[str, type[SolidBlock]] = {
 }
 """Solid elements by name."""
 
+DEFAULT_ELEMENT = "linear"
+"""Element of a body, unless another one is asked for."""
+
 PerElement = float | np.ndarray | Mapping[str, float] | Callable[[np.ndarray], np.ndarray]
 """A value for all elements, one for each (m,), one for each region by name, or a function of the centroids (m, 3)."""
 

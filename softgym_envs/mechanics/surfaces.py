@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -24,6 +24,46 @@ def connected_pieces(triangles: np.ndarray) -> list[np.ndarray]:
     return [triangles[piece == number] for number in np.unique(piece)]
 
 
+def sheets(nodes: np.ndarray, triangles: np.ndarray) -> list[np.ndarray]:
+    """Split the closed boundary (k, 3) of a body into sheets, seen from outside the material.
+
+    At an edge that more than two triangles share, where hollows of a coarse mesh pinch themselves or each other, those
+    on both sides of one empty wedge belong together.
+
+    Args:
+        nodes: positions [m], shape (n, 3).
+        triangles: boundary of tetrahedra, counter-clockwise from outside the material.
+    """
+    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    owner = np.tile(np.arange(len(triangles)), 3)
+    order = np.lexsort(np.sort(edges, axis=1).T)
+    ends = np.sort(edges, axis=1)[order]
+    starts = np.flatnonzero(np.r_[True, (np.diff(ends, axis=0) != 0).any(axis=1)])
+    sizes = np.diff(np.r_[starts, len(order)])
+    plain = starts[sizes == 2]
+    pairs = [np.column_stack([owner[order[plain]], owner[order[plain + 1]]])]
+    for start, size in zip(starts[sizes > 2].tolist(), sizes[sizes > 2].tolist(), strict=True):
+        around = order[start : start + size]
+        low, high = ends[start]
+        axis = nodes[high] - nodes[low]
+        axis /= np.linalg.norm(axis)
+        apex = nodes[triangles[owner[around]].sum(axis=1) - low - high] - nodes[low]
+        apex -= np.outer(apex @ axis, axis)
+        first = apex[0] / np.linalg.norm(apex[0])
+        angle = np.arctan2(apex @ np.cross(axis, first), apex @ first)
+        turn = np.argsort(angle)
+        # The empty side of a triangle that runs along the axis lies counter-clockwise of it.
+        along = edges[around, 0] == low
+        for k, here in enumerate(turn):
+            after = turn[(k + 1) % size]
+            if along[here] and not along[after]:
+                pairs.append(np.array([[owner[around[here]], owner[around[after]]]]))
+    joined = np.concatenate(pairs)
+    graph = coo_matrix((np.ones(len(joined)), (joined[:, 0], joined[:, 1])), shape=2 * (len(triangles),))
+    number = connected_components(graph, directed=False)[1]
+    return [triangles[number == k] for k in range(number.max(initial=-1) + 1)]
+
+
 def inner_surfaces(nodes: np.ndarray, tetrahedra: np.ndarray) -> list[np.ndarray]:
     """Find the closed cavities of a mesh.
 
@@ -35,8 +75,7 @@ def inner_surfaces(nodes: np.ndarray, tetrahedra: np.ndarray) -> list[np.ndarray
         Triangles (k, 3) of each cavity, seen counter-clockwise from inside it.
     """
     # Material lies inside the hull and outside the cavities: the volume within a cavity counts as negative.
-    pieces = connected_pieces(boundary_triangles(tetrahedra))
-    return [piece for piece in pieces if enclosed_volume(nodes, piece) < 0.0]
+    return [piece for piece in sheets(nodes, boundary_triangles(tetrahedra)) if enclosed_volume(nodes, piece) < 0.0]
 
 
 def encloses(nodes: np.ndarray, triangles: np.ndarray, point: np.ndarray) -> bool:
@@ -73,6 +112,47 @@ def cavity_around(nodes: np.ndarray, tetrahedra: np.ndarray, point: np.ndarray, 
         raise ValueError(f"no closed cavity of the body encloses {point.tolist()} m for '{name}'; {known}")
     # A part inside a cavity may itself have a cavity: take the smallest one.
     return min(around, key=lambda piece: abs(enclosed_volume(nodes, piece)))
+
+
+def cavity_like(
+    nodes: np.ndarray, tetrahedra: np.ndarray, surfaces: Sequence[tuple[np.ndarray, np.ndarray]], name: str
+) -> np.ndarray:
+    """Return the surface (k, 3) of the cavity of a mesh that a surface in space fills.
+
+    It fills one if their boxes differ by less than a tenth of their size and their volumes by less than a quarter:
+    meshes of one shape differ in how they round it.
+
+    Args:
+        nodes: positions [m], shape (n, 3).
+        tetrahedra: corner indices of positively oriented tetrahedra, shape (m, 4).
+        surfaces: points [m] (p, 3) and triangles (t, 3) of the surface, in each unit that it may have.
+        name: of the cavity, for the message.
+
+    Raises:
+        ValueError: if the surface fills none, or several.
+    """
+    hollows = inner_surfaces(nodes, tetrahedra)
+    boxes = [np.array([nodes[np.unique(each)].min(axis=0), nodes[np.unique(each)].max(axis=0)]) for each in hollows]
+    found: dict[int, float] = {}
+    for points, triangles in surfaces:
+        used = points[np.unique(triangles)]
+        box, volume = np.array([used.min(axis=0), used.max(axis=0)]), abs(enclosed_volume(points, triangles))
+        for number, (hollow, other) in enumerate(zip(hollows, boxes, strict=True)):
+            off = float(np.abs(box - other).max() / np.ptp(other, axis=0).max())
+            inner = abs(enclosed_volume(nodes, hollow))
+            if off < 0.1 and abs(volume - inner) < 0.25 * inner:
+                found[number] = min(off, found.get(number, np.inf))
+    if found:
+        return hollows[min(found, key=lambda number: found[number])]
+    points, triangles = surfaces[0]
+    used = points[np.unique(triangles)]
+    spans = ", ".join(f"{a:.4g} to {b:.4g}" for a, b in zip(used.min(axis=0), used.max(axis=0), strict=True))
+    places = [" x ".join(f"{a:.4g} to {b:.4g}" for a, b in box.T) + " m" for box in boxes]
+    known = f"its cavities span {'; '.join(places)}" if places else "it has none, or they are open to the outside"
+    raise ValueError(
+        f"the surface of cavity '{name}', which spans {spans} in the numbers of its file, fills no cavity of the body; "
+        f"{known}"
+    )
 
 
 @njit(cache=True, error_model="numpy")

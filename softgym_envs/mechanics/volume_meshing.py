@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-import tempfile
+import time
 from itertools import permutations
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse.csgraph import breadth_first_order, connected_components
 from scipy.spatial import cKDTree
 
-from softgym_envs.errors import DataError, MeshingError
+from softgym_envs.errors import DataError
 from softgym_envs.mechanics.constraints.cavity import enclosed_volume
-from softgym_envs.mechanics.gmsh_process import UNUSABLE
+from softgym_envs.mechanics.gmsh_process import GmshFailure, run_gmsh
 from softgym_envs.mechanics.surfaces import connected_pieces, encloses, self_intersection
+
+_ANGLES = (40.0, 80.0, np.nan)
+"""Ways to fill a surface: triangles that meet at a larger angle [degrees] form an edge of the shape; NaN: as it is."""
+
+_LOST_VOLUME = 0.25
+"""Part of the volume that coarser triangles on a curved surface may lose; more shows that a face is missing."""
 
 
 def fill_surface(
@@ -63,19 +66,47 @@ def fill_surface(
     if place is not None:
         raise DataError(f"the surface of '{source}' intersects itself near {np.round(place, 6).tolist()} m")
     parts = _nesting(points, shells, source)
-    with tempfile.TemporaryDirectory() as scratch:
-        request, output = Path(scratch) / "surface.npz", Path(scratch) / "mesh.npz"
-        np.savez(
-            request,
-            points=points / diagonal,  # the tolerances of gmsh are absolute
-            triangles=np.concatenate(shells),
-            shells=np.repeat(np.arange(len(shells)), [len(shell) for shell in shells]),
-            parts=parts,
-            mesh_size=size / diagonal,
-        )
-        _run(request, output, time_limit, source, size)
-        with np.load(output) as data:
-            return data["nodes"] * diagonal, data["tetrahedra"]
+    request = {
+        "points": points / diagonal,  # the tolerances of gmsh are absolute
+        "triangles": np.concatenate(shells),
+        "shells": np.repeat(np.arange(len(shells)), [len(shell) for shell in shells]),
+        "parts": parts,
+        "mesh_size": size / diagonal,
+    }
+    volumes = np.array([abs(enclosed_volume(points, shell)) for shell in shells])
+    volume = float(np.where(parts == np.arange(len(parts)), volumes, -volumes).sum())
+    nodes, tetrahedra = _fill(request, volume / diagonal**3, time_limit, source, size)
+    return nodes * diagonal, tetrahedra
+
+
+def _fill(
+    request: dict[str, Any], volume: float, time_limit: float, source: str, size: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Fill shells by the first way of `_ANGLES` that works, and check the volume."""
+    count, start, last = len(request["triangles"]), time.monotonic(), ""
+    for angle in _ANGLES:
+        try:
+            found = run_gmsh(
+                "fill",
+                {**request, "angle": angle},
+                time_limit=time_limit,
+                used=time.monotonic() - start,
+                task=f"meshing '{source}', a surface of {count} triangles, with mesh_size = {size:.3g} m",
+                remedy="pass a larger time_limit, or a larger mesh_size",
+            )
+        except GmshFailure as problem:
+            last = str(problem)
+            continue
+        nodes, tetrahedra = found["nodes"], found["tetrahedra"]
+        corners = nodes[tetrahedra]
+        filled = float(np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])).sum()) / 6.0
+        if abs(filled - volume) <= (_LOST_VOLUME if np.isfinite(angle) else 1e-6) * volume:
+            return nodes, tetrahedra
+        last = f"gmsh filled {100 * filled / volume:.0f} % of its volume"
+    raise DataError(
+        f"'{source}' cannot be meshed: {last}; its surface is closed and does not cross itself, and was tried with "
+        "edges at two angles and as it is; remesh it with triangles of about one size"
+    )
 
 
 def _weld(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -97,9 +128,16 @@ def _weld(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _shells(points: np.ndarray, triangles: np.ndarray, source: str) -> list[np.ndarray]:
-    """Split a surface into closed shells."""
-    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
-    _, first, counts = np.unique(np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True)
+    """Split a surface into closed shells, without its repeated triangles and with one orientation each."""
+    corners = np.sort(triangles, axis=1)
+    _, first, counts = np.unique(corners, axis=0, return_index=True, return_counts=True)
+    if (counts > 1).any():
+        # One copy belongs to the surface, or none: both sides of a sheet that sticks to it.
+        for chosen in (first, first[counts == 1]):
+            if len(chosen) and (_edge_counts(triangles[chosen])[2] == 2).all():
+                triangles = triangles[np.sort(chosen)]
+                break
+    edges, first, counts = _edge_counts(triangles)
     if (counts == 1).any():
         place = np.round(points[edges[first[counts == 1][0]]].mean(axis=0), 6).tolist()
         raise DataError(
@@ -112,9 +150,42 @@ def _shells(points: np.ndarray, triangles: np.ndarray, source: str) -> list[np.n
             f"the surface of '{source}' touches itself: {(counts > 2).sum()} edges belong to more than two triangles, "
             f"the first near {place} m"
         )
-    if len(np.unique(edges, axis=0)) != len(edges):
-        raise DataError(f"the triangles of '{source}' are oriented inconsistently; make their normals consistent")
-    return connected_pieces(triangles)
+    return connected_pieces(_oriented(triangles, source))
+
+
+def _edge_counts(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Edges of triangles (3 k, 2), the first place of each among them, and how many triangles have it."""
+    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    _, first, counts = np.unique(np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True)
+    return edges, first, counts
+
+
+def _oriented(triangles: np.ndarray, source: str) -> np.ndarray:
+    """Turn triangles (k, 3) that look another way than their neighbours; each edge has two of them."""
+    count = len(triangles)
+    edges, _, _ = _edge_counts(triangles)
+    order = np.lexsort(np.sort(edges, axis=1).T)
+    one, two = order[::2], order[1::2]
+    alike = edges[one, 0] == edges[two, 1]  # neighbours run along their edge in opposite directions
+    if alike.all():
+        return triangles
+    one, two = one % count, two % count
+    graph = coo_matrix((np.ones(len(one)), (one, two)), shape=(count, count)).tocsr()
+    sign = {(a, b): same for a, b, same in zip(one.tolist(), two.tolist(), alike.tolist(), strict=True)}
+    turned = np.zeros(count, dtype=bool)
+    for start in np.unique(connected_components(graph, directed=False)[1], return_index=True)[1]:
+        found, before = breadth_first_order(graph, start, directed=False)
+        for triangle in found[1:].tolist():
+            last = int(before[triangle])
+            same = sign[last, triangle] if (last, triangle) in sign else sign[triangle, last]
+            turned[triangle] = turned[last] if same else not turned[last]
+        if turned[found].mean() > 0.5:
+            turned[found] = ~turned[found]  # keep the orientation of most
+    out = triangles.copy()
+    out[turned] = out[turned][:, ::-1]
+    if ((turned[one] == turned[two]) != alike).any():
+        raise DataError(f"the surface of '{source}' has no inside: its triangles cannot be oriented consistently")
+    return out
 
 
 def _nesting(points: np.ndarray, shells: list[np.ndarray], source: str) -> np.ndarray:
@@ -135,21 +206,3 @@ def _nesting(points: np.ndarray, shells: list[np.ndarray], source: str) -> np.nd
         around = np.flatnonzero(within[i])
         parts[i] = around[np.argmin(volumes[around])]
     return parts
-
-
-def _run(request: Path, output: Path, time_limit: float, source: str, size: float) -> None:
-    """Mesh in a separate process: gmsh may crash or hang on a malformed surface."""
-    command = [sys.executable, "-m", "softgym_envs.mechanics.gmsh_process", str(request), str(output)]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=time_limit, env=environment, check=False)
-    except subprocess.TimeoutExpired:
-        raise MeshingError(
-            f"meshing '{source}' took longer than {time_limit:g} s with mesh_size = {size:.3g} m; "
-            "a larger mesh_size is faster"
-        ) from None
-    if done.returncode == UNUSABLE:
-        raise MeshingError(f"gmsh cannot be used: {done.stderr.strip().splitlines()[-1]}")
-    if done.returncode != 0 or not output.is_file():
-        lines = (done.stderr.strip() or done.stdout.strip() or "it crashed").splitlines()
-        raise DataError(f"'{source}' cannot be meshed: {lines[-1]}; does its surface intersect itself?")

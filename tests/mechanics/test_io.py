@@ -134,7 +134,7 @@ def test_file_that_is_not_a_mesh(tmp_path, name, rng):
 def test_file_without_tetrahedra(tmp_path, box):
     nodes, _ = box()
     meshio.Mesh(nodes, [("line", [[0, 1]])]).write(tmp_path / "wire.vtk")
-    with pytest.raises(DataError, match=r"no tetrahedra and no triangles; found: line"):
+    with pytest.raises(DataError, match=r"no tetrahedra and no triangles; found: 1 line"):
         read_mesh(tmp_path / "wire.vtk")
     meshio.Mesh(nodes, [("triangle", [[0, 1, 2]])]).write(tmp_path / "shell.vtk")
     with pytest.raises(DataError, match=r"shell.vtk' holds no closed surface: it has 1 triangles"):
@@ -412,7 +412,6 @@ FAULTS = {
     "crossing": ([BAR, cuboid((50, 5, 5), (90, 15, 15))], "intersects itself near"),
     "touching": ([BAR, cuboid((10, 20, 5), (30, 30, 15))], "two of its closed shells overlap"),
     "two bodies on one edge": ([BAR, cuboid((60, 20, 0), (70, 30, 20))], "touches itself: 1 edges belong to more than"),
-    "mixed": ([(BAR[0], np.vstack([BAR[1][:1, ::-1], BAR[1][1:]]))], "oriented inconsistently; make their normals"),
 }
 
 
@@ -437,7 +436,7 @@ def test_malformed_mesh_sizes_are_rejected(tmp_path, size, message):
 
 
 def test_meshing_has_a_time_limit(tmp_path):
-    with pytest.raises(MeshingError, match=r"took longer than 0.01 s with mesh_size = 0.00332 m; a larger mesh_size"):
+    with pytest.raises(MeshingError, match=r"12 triangles, .* 0.00332 m took longer than time_limit = 0.01 s; pass"):
         read_mesh(write_stl(tmp_path, BAR), unit="mm", time_limit=0.01)
 
 
