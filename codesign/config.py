@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from softgym_envs.agents.joint import PROPOSERS
+from softgym_envs.agents.learners import LEARNERS
 from softgym_envs.codesign.parts import (
     PRUNERS,
     STRATEGIES,
@@ -194,7 +195,7 @@ class StudyConfig(StudyProblem):
             )
         learner = self.training.learner
         refuse(
-            learner == "recurrent" and bool(self.plan.trains or self.finalists.seeds),
+            LEARNERS[learner].has_memory and bool(self.plan.trains or self.finalists.seeds),
             f"{ends} needs policies without memory, but training.learner = {learner}{allowed}",
         )
 

@@ -4,39 +4,42 @@ from __future__ import annotations
 
 import inspect
 import warnings
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from softgym_envs.config import Config
+from softgym_envs.registry import Table
 
 if TYPE_CHECKING:
     import optuna
 
-SAMPLERS: dict[str, str] = {
-    "tpe": "TPESampler",
-    "cmaes": "CmaEsSampler",
-    "gp": "GPSampler",
-    "nsgaii": "NSGAIISampler",
-    "qmc": "QMCSampler",
-    "random": "RandomSampler",
-}
-"""Registry: name to class of `optuna.samplers`."""
+SAMPLERS = Table(
+    "sampler",
+    {
+        "tpe": "optuna.samplers:TPESampler",
+        "cmaes": "optuna.samplers:CmaEsSampler",
+        "gp": "optuna.samplers:GPSampler",
+        "nsgaii": "optuna.samplers:NSGAIISampler",
+        "qmc": "optuna.samplers:QMCSampler",
+        "random": "optuna.samplers:RandomSampler",
+    },
+    group="softgym_envs.samplers",
+)
+"""Samplers of Optuna by name: those of Optuna itself and of installed packages, as classes."""
 
 
 class SamplerConfig(Config):
     """Algorithm that proposes designs: a key of `SAMPLERS`, its seed (`trial_seed`) and further arguments."""
 
-    name: Literal["tpe", "cmaes", "gp", "nsgaii", "qmc", "random"] = "tpe"
+    name: str = "tpe"
     seed: int = Field(default=0, ge=0)
     options: dict[str, Any] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _known_options(self) -> SamplerConfig:
-        import optuna
-
-        check_options("sampler", self.name, getattr(optuna.samplers, SAMPLERS[self.name]), self.options)
+        check_options("sampler", self.name, SAMPLERS.find(self.name), self.options)
         return self
 
 
@@ -53,10 +56,7 @@ def trial_seed(config: SamplerConfig, number: int) -> int:
 
 def make_sampler(config: SamplerConfig, number: int) -> optuna.samplers.BaseSampler:
     """Return the sampler for one trial."""
-    import optuna
-
-    cls = getattr(optuna.samplers, SAMPLERS[config.name])
-    return construct(cls, {"seed": trial_seed(config, number), **config.options})
+    return construct(SAMPLERS[config.name], {"seed": trial_seed(config, number), **config.options})
 
 
 def construct(cls: type, options: dict[str, Any]) -> Any:

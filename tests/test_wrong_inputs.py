@@ -253,7 +253,7 @@ MISTAKES = {
     ),
     "sampler": (
         lambda f: config(f, StudyConfig, FINGER, "sampler.name=tpee"),
-        "config '*': sampler.name: must be 'tpe', 'cmaes', 'gp', 'nsgaii', 'qmc' or 'random', got 'tpee'",
+        "config '*': sampler: unknown sampler 'tpee'; did you mean 'tpe'? *",
     ),
     "metric of a design search": (
         lambda f: config(f, OptimiseConfig, STRENGTH, "objectives=[{metric: contact_forse}]"),

@@ -57,6 +57,7 @@ class Learner(ABC):
         Config: its hyperparameters, `config.settings` of a training.
         title: its name in tables.
         model_based: whether it knows the model of the robot, as the inverse QP does.
+        has_memory: whether its policies remember earlier observations.
         config: configuration of the training.
         step: environment steps so far, over all sub-environments.
 
@@ -67,6 +68,7 @@ class Learner(ABC):
     Config: ClassVar[type[Config]] = Config
     title: ClassVar[str]
     model_based: ClassVar[bool] = False
+    has_memory: ClassVar[bool] = False
     step: int
 
     @classmethod

@@ -107,6 +107,7 @@ def shipped_robots() -> dict[str, tuple[str, dict[str, Any]]]:
     found = {}
     for folder in _folders(ROBOTS.place(name).partition(":")[0] for name in ROBOTS):
         for card in folder.glob("*/model.json"):
-            config = json.loads(card.read_text())["config"]
-            found[card.parent.name] = (config["robot"], config["robot_options"])
+            config = json.loads(card.read_text()).get("config")  # none for weights that no configuration made
+            if config is not None:
+                found[card.parent.name] = (config["robot"], config["robot_options"])
     return dict(sorted(found.items()))

@@ -34,7 +34,7 @@ BAD = {
         "sample_design",
         "false",
     ),
-    "unknown sampler": ({"sampler": {"name": "magic"}}, "sampler.name", "'tpe'"),
+    "unknown sampler": ({"sampler": {"name": "magic"}}, "sampler", "tpe"),
     "unknown sampler option": ({"sampler": {"name": "tpe", "options": {"wings": 2}}}, "wings", "n_startup_trials"),
     "unknown pruner": ({"pruner": {"name": "shears"}}, "pruner.name", "'median'"),
     "missing pruner option": (

@@ -243,7 +243,7 @@ def _optuna(name: str, **options: Any) -> Callable[[FrozenProblem, int], Optimis
         import optuna
 
         optuna.logging.set_verbosity(optuna.logging.ERROR)  # checking the options of qmc warns of a missing seed
-        config = SamplerConfig(name=name, seed=seed, options=options)  # type: ignore[arg-type]
+        config = SamplerConfig(name=name, seed=seed, options=options)
         return OptunaOptimiser(problem, make_sampler(config, 0))
 
     return make

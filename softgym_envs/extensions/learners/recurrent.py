@@ -48,6 +48,7 @@ class RecurrentLearner(NetworkLearner):
     Config = RecurrentConfig
     title = "recurrent"
     model_based = True
+    has_memory = True
 
     @classmethod
     def update_seconds(cls, config: TrainConfig) -> float:

@@ -1,0 +1,1 @@
+"""A package of your own for softgym-envs: pyproject.toml lists what it adds."""
