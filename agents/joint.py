@@ -48,7 +48,7 @@ class DesignProposer(ABC):
         self.size = len(self.names)
         #: Bodies of the present and of the previous episode of each sub-environment.
         self._bodies = np.zeros((2, vector.num_envs, self.size))
-        vector.design_sampler = self._sample
+        vector.set_design_sampler(self._sample)
         env.on_episode = self._ended
         self.restore(model)
 

@@ -190,6 +190,15 @@ class Backend(ABC):
     design: Design
     state: State
 
+    @classmethod
+    def batch_class(cls, robot: Robot, options: Mapping[str, object]) -> type | str | None:
+        """Return what steps many bodies of a robot in one call, as this backend with these options; None for nothing.
+
+        It is a `BatchBackend`, or the path of one, and takes the robot, designs (B, number of design variables) and
+        the same options.
+        """
+        return None
+
     @abstractmethod
     def reset(self, design: Mapping[str, float] | None = None) -> State:
         """Go to the rest equilibrium of a design (default: the current one). An unchanged design is not rebuilt.

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
+from softgym_envs.backends.backend import PointForce, State
 from softgym_envs.errors import InfeasibleDesign
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.robots.base import Robot
@@ -70,9 +72,13 @@ class BatchBackend(ABC):
         state: the present states.
         command: the commands that led to them, shape (B, n_a).
         moving: states have velocities.
+        takes_force: `push` takes forces on the effectors.
+        takes_touch: `touch` takes forces on points of the bodies.
     """
 
     moving: bool = False
+    takes_force: bool = False
+    takes_touch: bool = False
     robot: Robot
     state: BatchState
     command: np.ndarray
@@ -99,6 +105,28 @@ class BatchBackend(ABC):
     @abstractmethod
     def step(self, command: np.ndarray) -> None:
         """Go to the states under commands (B, n_a). Rows whose state is not found keep theirs and are not converged."""
+
+    def push(self, forces: Sequence[np.ndarray | None]) -> None:
+        """Push the first effectors from the next `step` on, with a force [N] (3,) or None for each row."""
+        raise ValueError(f"{type(self).__name__} takes no forces")
+
+    def touch(self, loads: Sequence[PointForce | None]) -> None:
+        """Touch the bodies from the next `step` on, one load or None for each; `rest` ends a touch."""
+        raise ValueError(f"{type(self).__name__} takes no forces")
+
+    def set_cables(self, index: np.ndarray, friction: Sequence[float], compliance: Sequence[Any]) -> None:
+        """Set `Backend.cable_friction` and `Backend.cable_compliance` of rows at rest.
+
+        Raises:
+            ValueError: for what is not computed.
+        """
+        if any(friction) or any(np.any(value) for value in compliance):
+            raise ValueError(f"{type(self).__name__} has neither friction nor compliance of cables; allowed: 0")
+
+    @property
+    def states(self) -> list[State]:
+        """The present mechanical states of the rows; empty where they are stepped together."""
+        return []
 
     @abstractmethod
     def effectors(self, index: np.ndarray, commands: np.ndarray) -> np.ndarray:
@@ -138,3 +166,25 @@ class BatchBackend(ABC):
             Two gradients, each (B, n_a): with all displacements held, as if no actuator were slack; and in the
             commands, zero for actuators that do not follow theirs.
         """
+
+
+def condensed_gradient(
+    compliance: np.ndarray, a: slice, e: slice, follows: np.ndarray, effector: np.ndarray, effort: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return what `BatchBackend.gradient` does, from ``W``.
+
+    Args:
+        compliance: of the states, shape (B, n, n).
+        a: rows of the actuators.
+        e: rows of the effectors.
+        follows: actuators that follow their commands, neither slack nor saturated: the efforts of the others stay what
+            they are. Shape (B, n_a).
+        effector: derivative of the function in the effector coordinates, shape (B, n_e).
+        effort: derivative in the efforts, shape (B, n_a).
+    """
+    W = compliance[:, a, a]
+    pulled = np.einsum("bea,be->ba", compliance[:, e, a], effector) + effort
+    held = np.linalg.solve(W, pulled[:, :, None])[:, :, 0]
+    both, unit = follows[:, :, None] & follows[:, None, :], np.eye(W.shape[1])
+    driven = np.linalg.solve(np.where(both, W, unit), np.where(follows, pulled, 0.0)[:, :, None])[:, :, 0]
+    return held, np.where(follows, driven, 0.0)

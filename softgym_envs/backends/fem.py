@@ -105,6 +105,12 @@ class FEMBackend(Backend):
         self.design = None  # type: ignore[assignment]  # until the first reset
         self.reset(robot.design_space.complete(design))
 
+    @classmethod
+    def batch_class(cls, robot: Robot, options: Mapping[str, object]) -> str | None:
+        if not robot.made_of_beams or robot.touches or options.get("scheme", "euler") != "euler":
+            return None
+        return "softgym_envs.backends.fem_batch:FEMBatch"
+
     @property
     def rest(self) -> State:
         """State of the present body at rest."""

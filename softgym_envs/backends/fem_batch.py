@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from softgym_envs.backends.batch import BatchBackend, BatchState
+from softgym_envs.backends.batch import BatchBackend, BatchState, condensed_gradient
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
@@ -235,14 +235,8 @@ class FEMBatch(BatchBackend):
 
     def gradient(self, effector: np.ndarray, effort: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         states, a, e = self._balanced, self._slices["a"], self._slices["e"]
-        W, size = states.compliance[:, a, a], self.command.shape[1]
-        pulled = np.einsum("bea,be->ba", states.compliance[:, e, a], effector) + effort
-        held = np.linalg.solve(W, pulled[:, :, None])[:, :, 0]
-        # Actuators that are slack or saturated do not follow their commands; their efforts stay what they are.
         follows = np.abs(states.delta[:, a] - self.command) < 1e-6 * self.robot.rates
-        both = follows[:, :, None] & follows[:, None, :]
-        driven = np.linalg.solve(np.where(both, W, np.eye(size)), np.where(follows, pulled, 0.0)[:, :, None])[:, :, 0]
-        return held, np.where(follows, driven, 0.0)
+        return condensed_gradient(states.compliance, a, e, follows, effector, effort)
 
 
 def _beams(owner: FEMBackend) -> BeamMotion:

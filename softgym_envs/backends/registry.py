@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from softgym_envs.registry import Registry, check_options
+from softgym_envs.registry import Registry, check_options, import_object
 
 if TYPE_CHECKING:
     from softgym_envs.backends.backend import Backend
@@ -22,21 +22,11 @@ BACKENDS = Registry(
     base="softgym_envs.backends.backend:Backend",
     group="softgym_envs.backends",
 )
-"""Backends by name: those of the suite and of installed packages."""
-
-BATCHES = Registry(
-    "batched backend",
-    {
-        "fem": "softgym_envs.backends.fem_batch:FEMBatch",
-        "surrogate": "softgym_envs.backends.surrogate:SurrogateBatch",
-    },
-    base="softgym_envs.backends.batch:BatchBackend",
-)
-"""Backends that step many bodies at once, by the same names."""
+"""Backends of all robots by name; `Robot.backends` replaces them for one robot."""
 
 
 def backend_class(name: str, robot: Robot) -> type[Backend]:
-    """Return the class of the backend with a name, for a robot that may have one of its own (`Robot.backends`).
+    """Return the class of a robot's backend with a name.
 
     Raises:
         ValueError: for an unknown name.
@@ -54,26 +44,18 @@ def check_backend(name: str, robot: Robot, options: Mapping[str, object]) -> Non
     check_options(f"backend '{name}'", backend_class(name, robot), 2, options)
 
 
-def make_backend(name: str, robot: Robot, **options: object) -> Backend:
+def make_backend(name: str, robot: Robot, design: Mapping[str, float] | None = None, **options: object) -> Backend:
     """Return the backend with a name, for a robot.
 
     Raises:
         ValueError: for an unknown name or option.
     """
-    cls: Any = backend_class(name, robot)
-    check_options(f"backend '{name}'", cls, 1, options)
-    made: Backend = cls(robot, **options)
+    check_backend(name, robot, options)
+    made: Backend = backend_class(name, robot)(robot, design, **options)  # type: ignore[call-arg]
     return made
 
 
-def is_batched(name: str, robot: Robot, options: Mapping[str, object]) -> bool:
-    """Whether a backend with options steps many bodies of a robot at once (`BATCHES`)."""
-    if name == "fem":
-        return robot.made_of_beams and not robot.touches and options.get("scheme", "euler") == "euler"
-    return name == "surrogate"
-
-
-def make_batch_backend(name: str, robot: Robot, **options: object) -> BatchBackend:
-    """Return the batched backend with a name, for a robot for which `is_batched` holds."""
-    made: BatchBackend = BATCHES.resolve(name)(robot, **options)  # `check_backend` checks the options
-    return made
+def batch_class(name: str, robot: Robot, options: Mapping[str, object]) -> type[BatchBackend] | None:
+    """Return what steps many bodies at once as a robot's backend with a name and options; None for nothing."""
+    found: Any = backend_class(name, robot).batch_class(robot, options)
+    return import_object("batched backend", found) if isinstance(found, str) else found

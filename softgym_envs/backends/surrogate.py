@@ -333,6 +333,10 @@ class SurrogateBackend(Backend):
         self.design = None  # type: ignore[assignment]  # until the first reset
         self.reset(robot.design_space.complete(design))
 
+    @classmethod
+    def batch_class(cls, robot: Robot, options: Mapping[str, object]) -> type[BatchBackend]:
+        return SurrogateBatch
+
     def reset(self, design: Mapping[str, float] | None = None) -> State:
         complete = self.design if design is None else self.robot.design_space.complete(design)
         if complete != self.design:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import copy
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
-from math import prod
 from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
@@ -14,53 +12,19 @@ import gymnasium
 import numpy as np
 from gymnasium.utils import EzPickle
 
-from softgym_envs.backends.backend import Backend, Snapshot, State
-from softgym_envs.backends.registry import make_backend
+from softgym_envs.backends.backend import Backend, State
 from softgym_envs.designs import Design
+from softgym_envs.envs.episodes import Episodes, EpisodeState
 from softgym_envs.envs.options import EnvironmentOptions, check_reset_options, set_up
-from softgym_envs.envs.plant import Plant, Sensed, sensed, stiffened
-from softgym_envs.envs.spaces import squash
-from softgym_envs.envs.tasks.base import check_drawn
-from softgym_envs.errors import ConvergenceError, InfeasibleDesign
+from softgym_envs.envs.plant import Plant, Sensed, stiffened
 
 if TYPE_CHECKING:
     from softgym_envs.envs.registration import RobotSource, TaskSource
     from softgym_envs.envs.tasks.base import Task
     from softgym_envs.robots.base import Robot
 
-MAX_DRAWS = 100
-"""Number of infeasible bodies that are drawn in turn before `reset` gives up."""
-
-
-@dataclass(frozen=True)
-class EpisodeState:
-    """A moment of an episode of `SoftRobotEnv`; it can be pickled.
-
-    Attributes:
-        robot: name of the robot.
-        task: name of the task.
-        options: robot and task as they were made: name -> value, as text.
-        physics: body and mechanical state.
-        path: goals of the episode [m, or the unit of the task's goals], shape (p, 3).
-        step: control steps so far.
-        progress: attributes of the task, which may change in an episode.
-        random: state of the random numbers; None if none have been drawn.
-        plant: how the robot differs from its model.
-        sent: commands that have not arrived at the drives yet, the oldest first, shape (delay, n_a).
-        sensed: what the sensors show.
-    """
-
-    robot: str
-    task: str
-    options: Mapping[str, str]
-    physics: Snapshot
-    path: np.ndarray
-    step: int
-    progress: dict[str, Any]
-    random: Mapping[str, Any] | None
-    plant: Plant
-    sent: np.ndarray
-    sensed: Sensed | None
+#: All rows of an environment of one body, and no row.
+ONLY, NONE = np.zeros(1, dtype=np.int64), np.zeros(0, dtype=np.int64)
 
 
 class SoftRobotEnv(gymnasium.Env, EzPickle):
@@ -112,41 +76,25 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         self.render_mode = render_mode
         self.render_size = render_size
         checked = EnvironmentOptions.check(options, own=("render_mode", "render_size"))
-        setup = set_up(robot, task, backend, checked)
-        self.robot, self.task = setup.robot, setup.task
+        self._episodes = Episodes(set_up(robot, task, backend, checked), 1, alone=True)
+        self.robot, self.task, self.spaces = self._episodes.robot, self._episodes.task, self._episodes.spaces
         self._made = _option_texts(self.robot, self.task)
         self.design_space = self.robot.design_space
-        self._fixed_design, self._sampled = setup.design, setup.sampled
-        self.backend: Backend = make_backend(
-            setup.backend, self.robot, design=self._fixed_design, **setup.backend_options
-        )
-        takes = self.backend.takes_force or not self.task.pushes
-        if not takes or (self.task.touches and not self.backend.takes_touch):
-            raise ValueError(
-                f"task '{self.task.name}' pushes the robot, but backend '{setup.backend}' takes no forces; "
-                "allowed: 'fem'"
-            )
-        self.spaces = setup.spaces(moving=self.backend.moving)
+        owned: Any = self._episodes.backend
+        self.backend: Backend = owned.owners[0]
         self.action_space = self.spaces.action_space
         self.observation_space = self.spaces.observation_space
-        self._plants = setup.plants
-        stretch = np.atleast_1d(self.backend.cable_compliance)
-        own = Plant(
-            cable_friction=self.backend.cable_friction,
-            cable_compliance=tuple(map(float, stretch)) if stretch.any() else 0.0,
-        )
-        self._fixed_plant = self.plant = own  # unless there are `_plants`
-        self._sent = np.zeros((0, len(self.robot.actuators)))
-        self._sensed: Sensed | None = None
         self._renderer: Any = None
-        self._path = np.zeros((1, 3))
-        self._observe_design(self._fixed_design)
-        self._step = 0
 
     @property
     def design(self) -> Design:
         """The present body."""
         return self.backend.design
+
+    @property
+    def plant(self) -> Plant:
+        """How the present robot differs from its model."""
+        return self._episodes.plant[0]
 
     @property
     def state(self) -> State:
@@ -156,38 +104,35 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
     @property
     def command(self) -> np.ndarray:
         """The command that was sent last, shape (n_a,); with a delay it has not arrived yet."""
-        return self._sent[-1] if len(self._sent) else self.backend.state.command
+        return self._episodes.command[0]
 
     @property
     def sensed(self) -> Sensed:
         """What the sensors show of the present state."""
+        if (shown := self._episodes.shown_rows(0)) is not None:
+            return shown
         state = self.state
-        return self._sensed or Sensed(
-            state.displacement, state.effort, self.task.measure(state), self.task.sensor_readings(state)
-        )
+        return Sensed(state.displacement, state.effort, self.task.measure(state), self.task.sensor_readings(state))
 
     @property
     def goal(self) -> np.ndarray:
         """The goal that the present state is rated by [m, or the unit of the task's goals], shape (3,)."""
-        return self._goal_at(self._step)
+        return self._episodes.goals()[0]
 
     @property
     def observed_goal(self) -> np.ndarray:
         """The goal that the observation shows, ``task.lookahead`` steps ahead of `goal`, shape (3,)."""
-        return self._goal_at(self._step + self.task.lookahead)
-
-    def _goal_at(self, step: int) -> np.ndarray:
-        return self.task.goals(self._path[None], np.array([len(self._path)]), np.array([step]))[0]
+        return self._episodes.goals(self.task.lookahead)[0]
 
     @property
     def steps(self) -> int:
         """Steps of the present episode so far."""
-        return self._step
+        return int(self._episodes.steps[0])
 
     @property
     def path(self) -> np.ndarray:
         """All goals of the episode [m, or the unit of the task's goals], shape (p, 3)."""
-        return self._path
+        return self._episodes.paths[0, : self._episodes.counts[0]]
 
     def reset(
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
@@ -206,54 +151,35 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         super().reset(seed=seed)
         given, goal = check_reset_options(options)
         # Check everything before anything changes.
-        path = None if goal is None else self.task.check_paths(goal)
-        if given is None and self._sampled:
-            design = self._draw_body()
-        else:
-            design = self._fixed_design if given is None else self.design_space.complete(given, self._fixed_design)
-            self.backend.reset(design)
-        self._begin_plant()
-        self._observe_design(design)
-        if path is None:
-            path = check_drawn(self.task, self.task.sample(self.np_random, 1, self._kinematics), 1)[0]
-        self._path = path
-        self.task.begin(self.np_random)
-        self._step = 0
+        paths = None if goal is None else self.task.check_paths(goal)[None]
+        designs = None
+        if given is not None:
+            designs = self.design_space.complete(given, self._episodes.fixed).array[None]
+        self._episodes.generators[0] = self.np_random
+        self._episodes.begin(ONLY, designs, paths)
         if self.render_mode == "human":
             self.render()
-        observation, _, info = self._observe()
+        observation, _, info = self._report()
         return observation, info
-
-    def _begin_plant(self) -> None:
-        """Choose the plant of an episode, at rest."""
-        self.plant = self._fixed_plant if self._plants is None else self._plants.sample(self.np_random)
-        # The commands that have not arrived yet; and the last one, if the drives did something else.
-        kept = self.plant.delay + (not self.plant.drives_exactly)
-        self._sent = np.zeros((kept, len(self.robot.actuators)))
-        self._sensed = None
-        self.backend.cable_friction = self.plant.cable_friction
-        self.backend.cable_compliance = self.plant.cable_compliance
-
-    def _observe_design(self, design: Design) -> None:
-        self._unit_design = self.design_space.observe(design.array, self.spaces.design_names)
 
     def get_state(self) -> EpisodeState:
         """Return the present moment of the episode, for `set_state`.
 
         Wrappers count steps for themselves: a time limit goes on counting after `set_state`.
         """
+        now = self._episodes
         return EpisodeState(
             robot=self.robot.name,
             task=self.task.name,
             options=self._made,
             physics=self.backend.snapshot(),
-            path=self._path.copy(),
-            step=self._step,
+            path=self.path.copy(),
+            step=self.steps,
             progress=copy.deepcopy({name: value for name, value in vars(self.task).items() if name != "robot"}),
             random=None if self._np_random is None else self._np_random.bit_generator.state,
             plant=self.plant,
-            sent=self._sent.copy(),
-            sensed=self._sensed,
+            sent=now.sent.copy(),
+            sensed=now.shown,
         )
 
     def set_state(self, state: EpisodeState) -> tuple[np.ndarray, dict[str, Any]]:
@@ -275,16 +201,15 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
             theirs, mine = (made.get(option, "its default") for made in (state.options, self._made))
             if theirs != mine:
                 raise ValueError(f"the state belongs to a {option} = {theirs:.80}, but the environment has {mine:.80}")
-        self.backend.cable_friction = state.plant.cable_friction
-        self.backend.cable_compliance = state.plant.cable_compliance
+        self._episodes.set_plant(0, state.plant)
+        self._episodes.set_cables(ONLY)
         self.backend.resume(state.physics)
-        self.plant, self._sent, self._sensed = state.plant, state.sent.copy(), state.sensed
-        self._observe_design(self.backend.design)
+        self._episodes.resume(self.backend.design.array, state)
         vars(self.task).update(copy.deepcopy(state.progress))
-        self._path, self._step = state.path.copy(), state.step
         if state.random is not None:
             self.np_random.bit_generator.state = state.random
-        observation, _, info = self._observe(sense=False)
+            self._episodes.generators[0] = self.np_random
+        observation, _, info = self._report(NONE)
         return observation, info
 
     def __getstate__(self) -> dict[str, Any]:
@@ -298,24 +223,6 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         self.set_state(kept["episode"])
         self.action_space = self.spaces.action_space = kept["action_space"]  # with its random numbers
 
-    def _draw_body(self) -> Design:
-        """Draw the sampled variables and go to the rest state of that body; bodies that cannot exist are drawn again.
-
-        Raises:
-            InfeasibleDesign: if `MAX_DRAWS` bodies in turn cannot exist.
-        """
-        for attempt in range(MAX_DRAWS):
-            drawn = self.design_space.sample(self.np_random, self._sampled)
-            design = self.design_space.complete({name: drawn[name] for name in self._sampled}, self._fixed_design)
-            try:
-                self.backend.reset(design)
-            except InfeasibleDesign:
-                if attempt == MAX_DRAWS - 1:
-                    raise
-            else:
-                break
-        return design
-
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Apply one action, shape (n_a,) in [-1, 1]; values outside are clipped.
 
@@ -328,75 +235,16 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         action = self.spaces.check_action(action)
         if action.ndim != 1:
             raise ValueError(f"action must have shape {self.action_space.shape}, got {action.shape}")
-        command = self.spaces.command(action, self.command)
-        if len(self._sent):
-            waiting = np.vstack([self._sent, command])
-            command, self._sent = waiting[-1 - self.plant.delay], waiting[1:]
-        command = self.plant.drive(command, self.backend.state.command)
-        converged = True
-        if self.task.touches:
-            self.backend.touch(self.plant.equivalent_model_force(self.task.touch(self._step)))
-        push = self.task.push(self._step)
-        try:
-            self.backend.step(command, force=None if push is None else push / self.plant.stiffness)
-        except ConvergenceError:
-            converged = False
-        self._step += 1
+        self._episodes.advance(action[None])
         if self.render_mode == "human":
             self.render()
-        observation, reward, info = self._observe(converged)
-        return observation, reward, bool(info["is_failed"]), not converged, info
+        observation, reward, info = self._report()
+        return observation, reward, bool(info["is_failed"]), not info["converged"], info
 
-    def _observe(self, converged: bool = True, *, sense: bool = True) -> tuple[np.ndarray, float, dict[str, Any]]:
-        """Return observation, reward and info of the present state; with ``sense``, the sensors are read anew."""
-        state, goal = self.state, self.goal
-        measured = self.task.measure(state)
-        true = Sensed(state.displacement, state.effort, measured, self.task.sensor_readings(state))
-        if sense and self.plant.noise:
-            self._sensed = sensed(self.robot, true, self.plant.noise, self.np_random, self.task.measured_scale)
-        distance, terms, _ = self.task.rate(measured, goal, self.spaces.effort_share(state.effort))
-        terms |= self.task.state_terms(state)
-        reward = float(prod(terms.values())) if converged else 0.0
-        info = {
-            "measured": measured.copy(),
-            "goal": goal.copy(),
-            "distance": distance,
-            "is_success": distance < self.task.success_distance,
-            "is_failed": self.task.is_failed(state),
-            **{f"reward_{name}": term for name, term in terms.items()},
-            "converged": converged,
-            **_mechanics(state),
-        }
-        if self._plants is not None:
-            for name, value in asdict(self.plant).items():
-                info[f"plant_{name}"] = np.array(value) if isinstance(value, tuple) else value
-        velocity = state.velocity[0] if self.spaces.moving else None
-        shown = self._sensed or true
-        sensors = self._sensor_values(squash(shown.sensors), sense) if self.task.sensors else None
-        observation = self.spaces.observe(
-            self.command,
-            shown.displacement,
-            shown.effort,
-            shown.effector,
-            self.observed_goal,
-            self._unit_design,
-            velocity,
-            sensors,
-        )
-        return observation, reward, {name: _with_dtype(value) for name, value in info.items()}
-
-    def _sensor_values(self, readings: np.ndarray, new: bool) -> np.ndarray:
-        """Return the sensor values of an observation for readings in [-1, 1] (s,): these, touch, earlier readings."""
-        command = (self.command - self.spaces.middle) / self.spaces.half_range
-        earlier = self.task.past_readings(np.concatenate([command, readings]), new)
-        return np.concatenate([readings, self.task.touch_readings(), earlier])
-
-    def _kinematics(self, commands: np.ndarray) -> np.ndarray:
-        """Return the effectors [m] (1, 3) that commands (1, n_a) lead to; NaN without an equilibrium."""
-        try:
-            return self.backend.probe(commands[0]).effector[:1]
-        except ConvergenceError:
-            return np.full((1, 3), np.nan)
+    def _report(self, index: np.ndarray | None = None) -> tuple[np.ndarray, float, dict[str, Any]]:
+        """Return observation, reward and info of the present state; the sensors are read anew unless in no row."""
+        observation, reward, info = self._episodes.report(index)
+        return observation, float(reward), {name: _with_dtype(value) for name, value in info.items()}
 
     def render(self) -> np.ndarray | None:
         """Return an image (height, width, 3) of the body, its cables, effector and goal.
@@ -417,7 +265,7 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         distance = float(self.task.distance(self.task.measure(state), self.goal))
         scale = self.task.distance_scale
         text = f"{scale.name} {scale.text(distance)}"
-        path, goal = self.task.drawn_goals(state, self._path, self.goal)
+        path, goal = self.task.drawn_goals(state, self.path, self.goal)
         image = self._renderer.render(self.backend.design, state, path, goal, text=text)
         return None if self.render_mode == "human" else image
 
@@ -442,27 +290,6 @@ def _option_texts(robot: Robot, task: Task) -> dict[str, str]:
         except (AttributeError, TypeError, ValueError):
             continue
     return texts
-
-
-def _mechanics(state: State) -> dict[str, Any]:
-    """Return what ``info`` says of a mechanical state."""
-    info: dict[str, Any] = {
-        "effector": state.effector[0].copy(),
-        "displacement": state.displacement.copy(),
-        "effort": state.effort.copy(),
-        "stable": state.stable,
-        "uncertainty": state.uncertainty,
-        "trusted": state.trusted,
-        "distrust": state.distrust,
-    }
-    if state.contacts is not None:
-        contacts = state.contacts
-        info |= {
-            "contact_force": contacts.total,
-            "smallest_gap": contacts.smallest_gap,
-            "sliding": contacts.sliding.mean() if contacts.count else 0.0,
-        }
-    return info
 
 
 # Gymnasium batches arrays of booleans, but not NumPy's boolean scalars.

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from softgym_envs.backends.registry import check_backend, is_batched
+from softgym_envs.backends.batch import BatchBackend
+from softgym_envs.backends.one_by_one import OneByOne
+from softgym_envs.backends.registry import batch_class, check_backend, make_backend
 from softgym_envs.backends.time_steps import shared_options
 from softgym_envs.designs import Design, DesignSpace
 from softgym_envs.envs.plant import Plants
@@ -107,10 +110,28 @@ class Setup:
 
     @property
     def batched(self) -> bool:
-        """Whether `SoftRobotVectorEnv` can step many of these environments together."""
-        if self.plants is not None and not self.plants.drive_exactly:
-            return False
-        return not _what_batches_lack(self.task) and is_batched(self.backend, self.robot, self.backend_options)
+        """Whether many of these environments step together in one call."""
+        return self._batch_class is not None
+
+    @property
+    def _batch_class(self) -> type[BatchBackend] | None:
+        if task_by_row(self.task) or (self.plants is not None and self.plants.change_cables):
+            return None
+        return batch_class(self.backend, self.robot, self.backend_options)
+
+    def make_backend(self, count: int, *, alone: bool = False) -> BatchBackend:
+        """Return the physics of ``count`` bodies, which step together where they can.
+
+        Args:
+            count: number of bodies.
+            alone: each body has a backend of its own in any case.
+        """
+        together: Any = None if alone else self._batch_class
+        if together is not None:
+            made: BatchBackend = together(self.robot, np.tile(self.design.array, (count, 1)), **self.backend_options)
+            return made
+        make = partial(make_backend, self.backend, self.robot, **self.backend_options)
+        return OneByOne(make, [self.design] * count)
 
     def spaces(self, *, moving: bool = False) -> AgentSpaces:
         """Return the agent's spaces; with ``moving``, observations include the effector's velocity."""
@@ -239,8 +260,8 @@ def take_reset_mask(options: Mapping[str, Any] | None, count: int) -> tuple[np.n
     return np.flatnonzero(mask), rest
 
 
-def check_seeds(seed: int | Sequence[int | None] | None, count: int) -> int | list[int | None] | None:
-    """Return the seed of ``count`` sub-environments, or a list of one for each, as Python's integers.
+def check_seeds(seed: int | Sequence[int | None] | None, count: int) -> list[int | None]:
+    """Return the seeds of ``count`` sub-environments, as Python's integers: an integer stands for it and the next ones.
 
     Raises:
         ValueError: for another number of seeds, or one that is neither None nor a non-negative integer.
@@ -252,26 +273,9 @@ def check_seeds(seed: int | Sequence[int | None] | None, count: int) -> int | li
     if many and len(seeds) != count:
         raise ValueError(f"seed must be an integer, None or a list of {count}, got {len(seeds)} seeds")
     integers = [None if one is None else int(one) for one in seeds]
-    return integers if many else integers[0]
-
-
-def joined_seed(seed: int | Sequence[int | None] | None, count: int, draw: Callable[[], int]) -> int | None:
-    """Return the one seed that stands for the seeds of ``count`` sub-environments.
-
-    Args:
-        seed: None, an integer, or ``count`` of either.
-        count: number of sub-environments.
-        draw: returns a random integer, which replaces None in a list with other seeds.
-
-    Raises:
-        ValueError: as `check_seeds`.
-    """
-    seeds = check_seeds(seed, count)
-    if not isinstance(seeds, list):
-        return seeds
-    if all(one is None for one in seeds):
-        return None
-    return int(np.random.SeedSequence([draw() if one is None else one for one in seeds]).generate_state(1)[0])
+    if many:
+        return integers
+    return [None if integers[0] is None else integers[0] + k for k in range(count)]
 
 
 def check_reset_options(options: Mapping[str, Any] | None) -> tuple[Any, Any]:
@@ -338,18 +342,10 @@ def check_counts(num_envs: int, max_episode_steps: int | None) -> None:
             raise ValueError(f"{name} = {value!r} must be an integer of at least 1")
 
 
-def check_batchable(task: Task) -> None:
-    """Raise ValueError for a task that a batched environment cannot rate."""
-    if lacking := _what_batches_lack(task):
-        raise ValueError(f"task '{task.name}' {lacking}")
-
-
-def _what_batches_lack(task: Task) -> str:
-    """Return what a task needs that batched environments do not have, for a message; empty for one that they take."""
+def task_by_row(task: Task) -> str:
+    """Return what a task does with single bodies rather than with arrays of many, for a message; empty for nothing."""
     if task.pushes or task.touches:
-        return "pushes the robot, but the batched environment takes no forces"
+        return "pushes the robot"
     if task.sensors:
-        return "shows sensors, which the batched environment does not have"
-    if task.needs_state:
-        return "reads forces of contacts, which the batched environment does not have"
-    return ""
+        return "shows sensors"
+    return "reads whole mechanical states" if task.needs_state else ""

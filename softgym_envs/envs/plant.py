@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.backends.backend import PointForce, State
+from softgym_envs.envs.random import RowRandom
 from softgym_envs.errors import unknown_name
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.quantities import QUANTITIES
@@ -46,12 +47,6 @@ class Plant:
         """Whether drives do what they are commanded to."""
         return not (np.any(np.asarray(self.gain) != 1.0) or np.any(self.offset) or np.any(self.backlash))
 
-    def drive(self, command: np.ndarray, last: np.ndarray) -> np.ndarray:
-        """Return what the drives do under a command (n_a,) after they did ``last`` (n_a,)."""
-        if self.drives_exactly:
-            return command
-        return play(self.gain * command + self.offset, last, np.asarray(self.backlash))
-
     def equivalent_model_force(self, load: PointForce | None) -> PointForce | None:
         """Return the force that deforms the model as a force on the plant deforms the plant.
 
@@ -63,7 +58,7 @@ class Plant:
 
 
 def play(command: np.ndarray, last: np.ndarray, width: np.ndarray) -> np.ndarray:
-    """Return where a drive with play ends up that was at ``last``: nowhere else if the command is within half of it."""
+    """Return where drives with play end up that were at ``last``: nowhere else if the command is within half of it."""
     return np.clip(last, command - 0.5 * width, command + 0.5 * width)
 
 
@@ -144,9 +139,13 @@ class Plants:
 
     @property
     def drive_exactly(self) -> bool:
-        """Whether the drives of all plants do what they are commanded to, with cables that do not stretch."""
-        ends = (self.low, self.high)
-        return all(plant.drives_exactly and not np.any(plant.cable_compliance) for plant in ends)
+        """Whether the drives of all plants do what they are commanded to."""
+        return self.low.drives_exactly and self.high.drives_exactly
+
+    @property
+    def change_cables(self) -> bool:
+        """Whether cables have friction or stretch."""
+        return bool(self.high.cable_friction or np.any(self.high.cable_compliance))
 
     @property
     def longest_delay(self) -> int:
@@ -219,26 +218,24 @@ def _ends(name: str, given: object) -> tuple[float, float]:
     return typed(ends[0]), typed(ends[-1])
 
 
-def sensed(
-    robot: Robot, true: Sensed, noise: np.ndarray | float, rng: np.random.Generator, measured_scale: float
-) -> Sensed:
-    """Return true values with Gaussian noise of a standard deviation (...), see `Plant`.
+def sensed(robot: Robot, true: Sensed, noise: np.ndarray, random: RowRandom, measured_scale: float) -> Sensed:
+    """Return true values of B bodies with Gaussian noise, see `Plant`.
 
     Args:
         robot: the robot.
         true: the true values.
-        noise: relative standard deviation, shape (...).
-        rng: random numbers.
+        noise: relative standard deviation, shape (B,).
+        random: random numbers of the bodies.
         measured_scale: that of the task, see `Task`.
     """
     if not np.any(noise):
         return true
-    level = np.asarray(noise)[..., None]
+    level = noise[:, None]
     return Sensed(
-        true.displacement + level * (robot.upper - robot.lower) * rng.normal(size=true.displacement.shape),
-        true.effort + level * robot.effort_scale * rng.normal(size=true.effort.shape),
-        true.effector + level * measured_scale * rng.normal(size=true.effector.shape),
-        true.sensors + level * rng.normal(size=true.sensors.shape) if true.sensors.size else true.sensors,
+        true.displacement + level * (robot.upper - robot.lower) * random.normal(true.displacement.shape),
+        true.effort + level * robot.effort_scale * random.normal(true.effort.shape),
+        true.effector + level * measured_scale * random.normal(true.effector.shape),
+        true.sensors + level * random.normal(true.sensors.shape) if true.sensors.size else true.sensors,
     )
 
 

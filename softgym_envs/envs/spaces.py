@@ -178,8 +178,10 @@ class AgentSpaces:
             ]
             if self.moving and velocity is not None:
                 parts.append(squash(velocity / self.robot.size))
-        observation = xp.concatenate((*parts, unit_design), axis=-1).clip(-1.0, 1.0)
-        return observation.astype(np.float32) if xp is np else observation
+        observation = xp.concatenate((*parts, unit_design), axis=-1)
+        if xp is np:
+            return np.minimum(np.maximum(observation, -1.0), 1.0).astype(np.float32)
+        return observation.clip(-1.0, 1.0)
 
     def _goal_parts(self, effector: Array, goal: Array) -> tuple[Array, Array]:
         return goal / self.position_scale, squash(self.axes * (goal - effector) / self.error_scale)
@@ -200,7 +202,7 @@ class AgentSpaces:
 
     def effort_share(self, effort: Array) -> Array:
         """Return the mean over the actuators (...) of efforts (..., n_a) relative to their scale."""
-        return abs(effort / self.effort_scale).mean(axis=-1)
+        return abs(effort / self.effort_scale).sum(axis=-1) / len(self.effort_scale)
 
     def observed_effort_share(self, observation: np.ndarray) -> np.ndarray:
         """Return `effort_share` (...) of the efforts in observations (..., d)."""

@@ -27,16 +27,17 @@ from softgym_envs.envs.options import (
     EnvironmentOptions,
     Setup,
     check_autoreset,
-    check_batchable,
     check_counts,
     check_design_option,
     check_reset_options,
+    check_seeds,
     complete_bodies,
-    joined_seed,
     set_up,
     take_reset_mask,
+    task_by_row,
 )
 from softgym_envs.envs.registration import ENVIRONMENTS, find_row
+from softgym_envs.envs.tasks.base import draw_paths
 from softgym_envs.surrogate.pretrained import standalone_model
 
 if TYPE_CHECKING:
@@ -218,7 +219,7 @@ class TorchVectorEnv(VectorEnv[Tensor, Tensor, Tensor]):
             self._changed[index] = False
         bodies = take_rows(self._bodies, index)
         if paths is None:
-            paths = self._task.sample(self._random, len(index), lambda commands: self._kinematics(bodies, commands))
+            paths = draw_paths(self._task, index, lambda rows: self._random, self._kinematics)
         if paths.shape[1] > self._state["paths"].shape[1]:
             self._state["paths"] = self._state["paths"].new_zeros(self.num_envs, *paths.shape[1:])
             self._advance_fast = None
@@ -229,9 +230,9 @@ class TorchVectorEnv(VectorEnv[Tensor, Tensor, Tensor]):
             self._state[name][index] = value
         self._state["paths"][index, : paths.shape[1]] = paths
 
-    def _kinematics(self, bodies: Bodies, commands: Tensor) -> Tensor:
-        """Return the effectors [m] (B, 3) that commands (B, n_a) lead to; NaN where no equilibrium is found."""
-        target = self._scaled(commands)
+    def _kinematics(self, index: Tensor, commands: Tensor) -> Tensor:
+        """Return the effectors [m] (B, 3) of rows (B,) under commands (B, n_a); NaN where no equilibrium is found."""
+        bodies, target = take_rows(self._bodies, index), self._scaled(commands)
         u, _, found = self._model.search(bodies, target, target, MAX_NEWTON_STEPS, stop=True)
         return torch.where(found[:, None], self._model.measure(bodies, u, u)[0], torch.nan)
 
@@ -268,11 +269,12 @@ class TorchVectorEnv(VectorEnv[Tensor, Tensor, Tensor]):
         if design is not None:
             designs = self._check_designs(design)
             designs = designs if len(designs) == 1 else designs[index]
-        seed = joined_seed(seed, self.num_envs, self._random_seed)
-        seed = self._first_seed if seed is None else seed
+        seeds = [one for one in check_seeds(seed, self.num_envs) if one is not None]
+        if seeds:
+            self._generator.manual_seed(int(np.random.SeedSequence(seeds).generate_state(1)[0]))
+        elif self._first_seed is not None:
+            self._generator.manual_seed(self._first_seed)
         self._first_seed = None
-        if seed is not None:
-            self._generator.manual_seed(seed)
         self._begin_episodes(index, designs, paths)
         self._started = True
         if self._ended is not None:
@@ -474,7 +476,8 @@ def _check_setup(id: str, setup: Setup) -> None:
         raise ValueError("plant is not available on tensors; allowed: None, or gymnasium.make_vec")
     if chosen := [name for name in setup.shown if setup.robot.design_space[name].choices]:
         raise ValueError(f"design_in_observation = {chosen} are choices, which this environment does not show")
-    check_batchable(setup.task)
+    if does := task_by_row(setup.task):
+        raise ValueError(f"task '{setup.task.name}' {does}, which tensors do not have; use gymnasium.make_vec")
 
 
 class _TorchRandom:

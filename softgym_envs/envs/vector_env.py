@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -14,24 +13,19 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from softgym_envs.backends.batch import BatchState
-from softgym_envs.backends.registry import is_batched, make_batch_backend
-from softgym_envs.envs.env import MAX_DRAWS
+from softgym_envs.envs.episodes import Episodes
 from softgym_envs.envs.gradients import RewardGradient, StepGradient
 from softgym_envs.envs.options import (
     EnvironmentOptions,
     check_autoreset,
-    check_batchable,
     check_counts,
     check_design_option,
     check_reset_options,
+    check_seeds,
     complete_bodies,
-    joined_seed,
     set_up,
     take_reset_mask,
 )
-from softgym_envs.envs.plant import OF_DRIVES, Plant, Sensed, sensed
-from softgym_envs.envs.tasks.base import check_drawn
-from softgym_envs.errors import InfeasibleDesign
 from softgym_envs.mechanics.condensation import CondensedModel
 
 if TYPE_CHECKING:
@@ -39,7 +33,10 @@ if TYPE_CHECKING:
 
 
 class SoftRobotVectorEnv(VectorEnv):
-    """``num_envs`` copies of a `SoftRobotEnv` that step together, on the surrogate or on finite elements of beams.
+    """``num_envs`` copies of a `SoftRobotEnv` in one process, each with the episodes of its seed.
+
+    The surrogate, and finite elements of beams, step them in one call. All others are stepped one after the other:
+    ``gymnasium.make_vec`` takes processes for them (`ParallelVectorEnv`).
 
     Sub-environments that end are reset as Gymnasium's `AutoresetMode` says. ``"SameStep"``: the returned observation is
     the first of the next episode, and ``info["final_obs"]``, ``info["final_info"]`` hold the end of the last one.
@@ -52,14 +49,13 @@ class SoftRobotVectorEnv(VectorEnv):
         num_envs: number of sub-environments.
         max_episode_steps: time limit; default none.
         autoreset_mode: ``"SameStep"``, ``"NextStep"`` or ``"Disabled"``.
-        backend: ``"surrogate"``, or ``"fem"`` for robots of beams; ``gymnasium.make_vec`` steps the others in processes
-            (`ParallelVectorEnv`).
+        backend: as for `SoftRobotEnv`.
         render_mode: must be None; batches are not rendered.
         **options: ``design``, ``action_mode`` and the other arguments that the page of each environment ID lists;
             every sub-environment samples its own design.
 
     Raises:
-        ValueError: for a wrong option, or a robot whose bodies cannot be stepped together on this backend.
+        ValueError: for a wrong option.
         DesignError: for a malformed design.
         InfeasibleDesign: if the body cannot exist.
         WeightsError: if the surrogate's weights are damaged or belong to another robot.
@@ -81,151 +77,84 @@ class SoftRobotVectorEnv(VectorEnv):
     ) -> None:
         if render_mode is not None:
             raise ValueError(
-                f"render_mode = {render_mode!r} is not available in the batched environment; allowed: None"
+                f"render_mode = {render_mode!r} is not available in the batched environment; allowed: None. To film, "
+                "use gymnasium.make_vec(ID, vectorization_mode='sync', render_mode='rgb_array') or `softgym rollout ID "
+                "--video FILE`"
             )
         check_counts(num_envs, max_episode_steps)
         self.autoreset_mode = check_autoreset(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
         checked = EnvironmentOptions.check(options, own=("max_episode_steps", "autoreset_mode"))
-        setup = set_up(robot, task, backend, checked)
-        self.robot, self.task = setup.robot, setup.task
-        if not is_batched(setup.backend, self.robot, setup.backend_options):
-            raise ValueError(
-                f"backend = {setup.backend!r} of robot '{self.robot.name}' has no batched environment; "
-                "allowed: 'surrogate', or gymnasium.make_vec, which steps it in processes"
-            )
-        check_batchable(self.task)
+        self._episodes = Episodes(set_up(robot, task, backend, checked), num_envs)
+        self.robot, self.task, self.spaces = self._episodes.robot, self._episodes.task, self._episodes.spaces
+        self.backend = self._episodes.backend
         self.num_envs = num_envs
         self.render_mode = None
         self.design_space = self.robot.design_space
         self.max_episode_steps = max_episode_steps if max_episode_steps is not None else np.iinfo(np.int64).max
-        self._fixed_design, self.sampled_variables = setup.design, setup.sampled
-        #: Draws the sampled variables of sub-environments ``index`` in unit coordinates [-1, 1], shape (len(index),
-        #: number of sampled variables). Replace this function to draw bodies in another way.
-        self.design_sampler: Callable[[np.random.Generator, np.ndarray], np.ndarray] = self._draw_uniformly
-        self.designs = np.tile(self._fixed_design.array, (num_envs, 1))
-        self.backend = make_batch_backend(setup.backend, self.robot, designs=self.designs, **setup.backend_options)
-        self.spaces = setup.spaces(moving=self.backend.moving)
         self.single_action_space = self.spaces.action_space
         self.single_observation_space = self.spaces.observation_space
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
-
-        self._plants = setup.plants
-        if setup.plants is not None and setup.plants.high.cable_friction:
-            raise ValueError("plant cable_friction is not available together for many bodies; allowed: 0")
-        if setup.plants is not None and not setup.plants.drive_exactly:
-            raise ValueError(f"plant {', '.join(OF_DRIVES)}: not available together for many bodies; allowed: defaults")
-        self._stiffness, self._noise = np.ones((num_envs, 1)), np.zeros(num_envs)
-        self._delay = np.zeros(num_envs, dtype=np.int64)
-        longest = 0 if setup.plants is None else setup.plants.longest_delay
-        self._sent = np.zeros((longest + 1, num_envs, len(self.robot.actuators)))  # the newest command first
-        self._sensed: Sensed | None = None  # what the sensors showed when they were last read
         self._reward_gradient: RewardGradient | None = None  # made when it is first needed, because it loads torch
-        self._unit_design = self.design_space.observe(self.designs, self.spaces.design_names)
-        self._paths = np.zeros((num_envs, 1, 3))
-        self._counts = np.ones(num_envs, dtype=np.int64)  # goals in each path
-        self._steps = np.zeros(num_envs, dtype=np.int64)
         self._begun = np.zeros(num_envs, dtype=bool)  # sub-environments that have been reset
         self._ended = np.zeros(num_envs, dtype=bool)  # episodes that are over and not reset yet
-        self._changed = np.zeros(num_envs, dtype=bool)  # bodies given in reset that differ from the fixed one
-
-    def _draw_uniformly(self, rng: np.random.Generator, index: np.ndarray) -> np.ndarray:
-        return rng.uniform(-1.0, 1.0, (len(self.sampled_variables), len(index))).T
-
-    # -- bodies -----------------------------------------------------------------------------------------------------
-
-    def _begin_bodies(self, index: np.ndarray, designs: np.ndarray) -> dict[int, InfeasibleDesign]:
-        """Change bodies, and return why some of them cannot exist."""
-        impossible = dict(self.backend.begin(index, designs))
-        changed = np.array([i not in impossible for i in index.tolist()], dtype=bool)
-        self.designs[index[changed]] = designs[changed]
-        self._unit_design[index] = self.design_space.observe(self.designs[index], self.spaces.design_names)
-        return impossible
-
-    def _draw_bodies(self, index: np.ndarray) -> None:
-        """Draw the sampled variables; bodies that cannot exist are drawn again.
-
-        Raises:
-            InfeasibleDesign: if `MAX_DRAWS` bodies in turn cannot exist.
-        """
-        names = self.design_space.names
-        columns = [names.index(name) for name in self.sampled_variables]
-        for attempt in range(MAX_DRAWS):
-            designs = np.tile(self._fixed_design.array, (len(index), 1))
-            for column, name, draws in zip(
-                columns, self.sampled_variables, self.design_sampler(self.np_random, index).T, strict=True
-            ):
-                designs[:, column] = self.design_space[name].from_unit(draws)
-            impossible = self._begin_bodies(index, designs)
-            if not impossible:
-                return
-            if attempt == MAX_DRAWS - 1:
-                raise next(iter(impossible.values()))
-            index = np.array(sorted(impossible))
-
-    def _begin_episodes(
-        self,
-        index: np.ndarray,
-        design: Mapping[str, float] | Sequence[Mapping[str, float]] | None = None,
-        goal: np.ndarray | None = None,
-    ) -> None:
-        """Start episodes in the sub-environments ``index``."""
-        if design is not None:
-            designs = complete_bodies(self.design_space, design, self._fixed_design, index)
-            self._changed[index] = True  # also if some of the bodies cannot exist
-            for error in self._begin_bodies(index, designs).values():
-                raise error
-        elif self.sampled_variables:
-            self._draw_bodies(index)
-        elif self._changed[index].any():
-            self._begin_bodies(index, np.tile(self._fixed_design.array, (len(index), 1)))
-            self._changed[index] = False
-        if self._plants is not None:
-            for i in index:
-                plant = self._plants.sample(self.np_random)
-                self._stiffness[i], self._noise[i], self._delay[i] = plant.stiffness, plant.noise, plant.delay
-            self._sent[:, index] = 0.0
-        self.backend.rest(index)
-        self._steps[index] = 0
-        self._begun[index], self._ended[index] = True, False
-        if goal is not None:
-            paths = goal
-        else:
-            drawn = self.task.sample(self.np_random, len(index), partial(self.backend.effectors, index))
-            paths = check_drawn(self.task, drawn, len(index))
-        missing = paths.shape[1] - self._paths.shape[1]
-        if missing > 0:
-            self._paths = np.pad(self._paths, ((0, 0), (0, missing), (0, 0)))
-        self._paths[index, : paths.shape[1]] = paths
-        self._counts[index] = paths.shape[1]
 
     # -- for controllers --------------------------------------------------------------------------------------------
 
     @property
+    def designs(self) -> np.ndarray:
+        """Bodies of the sub-environments, shape (num_envs, number of design variables)."""
+        return self._episodes.designs
+
+    @property
+    def sampled_variables(self) -> tuple[str, ...]:
+        """Design variables that each reset draws."""
+        return self._episodes.sampled
+
+    def set_design_sampler(self, sampler: Callable[[np.random.Generator, np.ndarray], np.ndarray]) -> None:
+        """Draw bodies in another way than uniformly, row by row.
+
+        Args:
+            sampler: maps `np_random`, a generator for all sub-environments, and the numbers of those to draw for to
+                their sampled variables in unit coordinates [-1, 1], shape (numbers, sampled variables).
+        """
+        self._episodes.sampler = partial(self._sample_designs, sampler)
+
+    def _sample_designs(
+        self, sampler: Callable[[np.random.Generator, np.ndarray], np.ndarray], index: np.ndarray
+    ) -> np.ndarray:
+        return sampler(self.np_random, index)
+
+    @property
+    def state(self) -> BatchState:
+        """The present mechanical states of the plants, without noise of sensors."""
+        return self._episodes.state
+
+    @property
     def command(self) -> np.ndarray:
         """Commands that were sent last, shape (num_envs, n_a); with a delay some have not arrived yet."""
-        return self._sent[0] if len(self._sent) > 1 else self.backend.command
+        return self._episodes.command
 
     @property
     def slack(self) -> np.ndarray:
         """Whether each actuator is slack, shape (num_envs, n_a)."""
-        return self._state.slack
+        return self.backend.state.slack
 
     @property
     def goals(self) -> np.ndarray:
         """Goals that the present states are rated by [m], shape (num_envs, 3)."""
-        return self.task.goals(self._paths, self._counts, self._steps)
+        return self._episodes.goals()
 
     @property
     def observed_goals(self) -> np.ndarray:
         """Goals that the observations show, ``task.lookahead`` steps ahead of `goals`, shape (num_envs, 3)."""
-        return self.task.goals(self._paths, self._counts, self._steps + self.task.lookahead)
+        return self._episodes.goals(self.task.lookahead)
 
     @property
     def paths(self) -> np.ndarray:
         """Goals of the present episodes [m], shape (num_envs, p, 3)."""
-        return self._paths
+        return self._episodes.paths
 
     @property
     def steps(self) -> np.ndarray:
@@ -233,28 +162,22 @@ class SoftRobotVectorEnv(VectorEnv):
 
         Learners set them so that episodes end at different times, which makes the states of a batch less alike.
         """
-        return self._steps
+        return self._episodes.steps
 
     @steps.setter
     def steps(self, values: np.ndarray) -> None:
         steps = np.asarray(values)
         if steps.shape != (self.num_envs,) or not np.issubdtype(steps.dtype, np.integer) or (steps < 0).any():
             raise ValueError(f"steps must be {self.num_envs} non-negative integers, got {values!r}")
-        self._steps[:] = steps
+        self._episodes.steps[:] = steps
 
     @property
     def condensed(self) -> CondensedModel:
         """Condensed models of the present states, evaluated at each access; leading shape (num_envs,)."""
-        found = self.backend.condensed
-        if self._plants is None:
+        found, stiffness = self.backend.condensed, self._episodes.stiffness
+        if (stiffness == 1.0).all():
             return found
-        stiffness = self._stiffness
         return replace(found, compliance=found.compliance / stiffness[:, :, None], effort=stiffness * found.effort)
-
-    @property
-    def _state(self) -> BatchState:
-        state = self.backend.state
-        return state if self._plants is None else replace(state, effort=self._stiffness * state.effort)
 
     # -- Gymnasium --------------------------------------------------------------------------------------------------
 
@@ -264,8 +187,8 @@ class SoftRobotVectorEnv(VectorEnv):
         """Start an episode in every sub-environment.
 
         Args:
-            seed: seed of the random numbers, which all sub-environments share, or a list of ``num_envs`` seeds to make
-                it from; None continues them, or stands for a random seed in a list.
+            seed: seed of the first sub-environment, to which the next ones add 1, 2, ...; or a list of ``num_envs``
+                seeds. Each draws what a single environment with its seed does; None continues the random numbers.
             options: ``"design"``: the body of all sub-environments, or a list of ``num_envs`` bodies; ``"goal"``: a
                 point (3,) or a path (p, 3) for all [m], or a path for each (num_envs, p, 3); ``"reset_mask"``: which
                 sub-environments to reset, boolean (num_envs,); default all.
@@ -275,7 +198,7 @@ class SoftRobotVectorEnv(VectorEnv):
             InfeasibleDesign: if a body cannot exist.
             ValueError: for an unknown option, a malformed seed, goal or mask, or another number of seeds or bodies.
         """
-        super().reset(seed=joined_seed(seed, self.num_envs, lambda: int(self.np_random.integers(2**31))))
+        seeds = check_seeds(seed, self.num_envs)
         index, options = take_reset_mask(options, self.num_envs)
         design, goal = check_reset_options(options)
         bodies = check_design_option(design, self.num_envs)
@@ -285,8 +208,17 @@ class SoftRobotVectorEnv(VectorEnv):
             shared = np.ndim(goal) < 3
             goal = self.task.check_paths(goal, () if shared else (self.num_envs,))
             goal = np.broadcast_to(goal, (self.num_envs, *goal.shape[-2:]))[index]
-        self._begin_episodes(index, design, goal)
-        return self._observe(index), self._info()[0]
+        if design is not None:
+            design = complete_bodies(self.design_space, design, self._episodes.fixed, index)
+        super().reset(seed=next((one for one in seeds if one is not None), None))
+        self._episodes.seed(index, [seeds[i] for i in index])
+        self._begin(index, design, goal)
+        observation, _, info = self._episodes.report(index)
+        return observation, self._masked(info)
+
+    def _begin(self, index: np.ndarray, designs: np.ndarray | None = None, paths: np.ndarray | None = None) -> None:
+        self._episodes.begin(index, designs, paths)
+        self._begun[index], self._ended[index] = True, False
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Apply actions (num_envs, n_a) in [-1, 1].
@@ -295,7 +227,7 @@ class SoftRobotVectorEnv(VectorEnv):
             ValueError: for actions with a wrong shape or values that are not finite.
             ResetNeeded: before the first `reset`, or without autoreset if an episode is over.
         """
-        self._advance(self._checked(actions))
+        self._episodes.advance(self._checked(actions))
         return self._finish_step()
 
     def step_with_gradient(
@@ -312,11 +244,11 @@ class SoftRobotVectorEnv(VectorEnv):
             ResetNeeded: before the first `reset`, or without autoreset if an episode is over.
             ImportError: without torch, which differentiates the task.
         """
-        if len(self._sent) > 1:
+        if self._episodes.delay.any():
             raise ValueError("plant delay: rewards of delayed commands have no derivatives in the actions of one step")
         actions = self._checked(actions)
         slope, limited = self.spaces.command_slope(actions, self.command)
-        self._advance(actions)
+        self._episodes.advance(actions)
         gradient = self._gradient(slope, limited, log, effort_weight)
         return *self._finish_step(), gradient
 
@@ -332,24 +264,15 @@ class SoftRobotVectorEnv(VectorEnv):
             raise ResetNeeded(f"the episodes of sub-environments {ended} are over; reset them with a reset_mask")
         return actions
 
-    def _advance(self, actions: np.ndarray) -> None:
-        """Move commands and states by one step."""
-        command = arriving = self.spaces.command(actions, self.command)
-        if len(self._sent) > 1:
-            self._sent = np.concatenate([command[None], self._sent[:-1]])
-            arriving = self._sent[self._delay, np.arange(self.num_envs)]
-        self.backend.step(arriving)
-        self._steps += 1
-
     def _gradient(self, slope: np.ndarray, limited: np.ndarray, log: bool, effort_weight: float) -> StepGradient:
         if self._reward_gradient is None:
             self._reward_gradient = RewardGradient(self.task, self.spaces)
-        state, goals = self.backend.settled(), self.goals
-        effector, effort = np.zeros_like(state.effector), self._stiffness * state.effort
+        state, goals, stiffness = self.backend.settled(), self.goals, self._episodes.stiffness
+        effector, effort = np.zeros_like(state.effector), stiffness * state.effort
         effector[:, :3], by_effort = self._reward_gradient(state.effector[:, :3], effort, goals, log)
-        held, command = self.backend.gradient(effector, effort_weight * self._stiffness * by_effort)
+        held, command = self.backend.gradient(effector, effort_weight * stiffness * by_effort)
         _, _, reward = self.task.rate(state.effector[:, :3], goals, self.spaces.effort_share(effort))
-        rated = state.converged & self._state.converged & ~self._ended
+        rated = state.converged & self.backend.state.converged & ~self._ended
         found, gap = rated[:, None], state.displacement - self.command
         held, command = np.where(found, held, 0.0), np.where(found, command, 0.0)
         reward = np.where(rated, reward, 0.0)
@@ -357,75 +280,32 @@ class SoftRobotVectorEnv(VectorEnv):
 
     def _finish_step(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Rate the present states, and start new episodes where the last ones have ended."""
-        rated = self._state.converged & ~self._ended
-        if self._ended.any():  # only where the next step resets them
-            self._begin_episodes(np.flatnonzero(self._ended))
-        info, reward = self._info()
-        observation = self._observe()
-        reward = np.where(rated, reward, 0.0)
-        truncated = (self._steps >= self.max_episode_steps) | ~self._state.converged
-        ended = np.flatnonzero(truncated)
+        episodes, ended, fresh = self._episodes, self._ended, None
+        if ended.any():  # only where the next step resets them
+            fresh = ended.copy()
+            self._begin(np.flatnonzero(fresh))
+        observation, reward, info = episodes.report()
+        truncated = (episodes.steps >= self.max_episode_steps) | ~info["converged"]
+        terminated = info["is_failed"].copy()
+        if fresh is not None:
+            reward = np.where(fresh, 0.0, reward)
+        over = truncated | terminated
         if self.autoreset_mode != AutoresetMode.SAME_STEP:
-            self._ended = truncated.copy()
-        elif len(ended):
-            final_info = info
-            final_obs = np.full(self.num_envs, None, dtype=object)
-            for i in ended:
-                final_obs[i] = observation[i].copy()
-            self._begin_episodes(ended)
-            observation = self._observe(ended)
-            info = {**self._info()[0], "final_info": final_info, "_final_info": truncated.copy()}
-            info |= {"final_obs": final_obs, "_final_obs": truncated.copy()}
-        return observation, reward, np.zeros(self.num_envs, dtype=bool), truncated, info
+            self._ended = over
+            return observation, reward, terminated, truncated, self._masked(info)
+        rows = np.flatnonzero(over)
+        if not len(rows):
+            return observation, reward, terminated, truncated, self._masked(info)
+        final_obs = np.full(self.num_envs, None, dtype=object)
+        for i in rows:
+            final_obs[i] = observation[i].copy()
+        final = {"final_info": self._masked(info), "_final_info": over.copy()}
+        final |= {"final_obs": final_obs, "_final_obs": over.copy()}
+        self._begin(rows)
+        observation, _, info = episodes.report(rows)
+        return observation, reward, terminated, truncated, self._masked(info) | final
 
-    def _observe(self, index: np.ndarray | None = None) -> np.ndarray:
-        """Return observations; only the sensors of sub-environments ``index`` (default all) are read anew."""
-        shown = self._read(index)
-        return self.spaces.observe(
-            self.command,
-            shown.displacement,
-            shown.effort,
-            shown.effector,
-            self.observed_goals,
-            self._unit_design,
-            self.backend.velocity,
-        )
-
-    def _read(self, index: np.ndarray | None) -> Sensed:
-        """Read the sensors of sub-environments ``index`` (default all), and return what those of all show."""
-        state = self._state
-        true = Sensed(state.displacement, state.effort, state.effector[:, :3])
-        if self._plants is None or not self._plants.high.noise:
-            return true
-        if index is None or self._sensed is None:
-            index = np.arange(self.num_envs)
-        rows = Sensed(true.displacement[index], true.effort[index], true.effector[index])
-        new = sensed(self.robot, rows, self._noise[index], self.np_random, self.task.measured_scale)
-        shown = copy.deepcopy(self._sensed or true)
-        for name in ("displacement", "effort", "effector"):
-            getattr(shown, name)[index] = getattr(new, name)
-        self._sensed = shown
-        return shown
-
-    def _info(self) -> tuple[dict[str, Any], np.ndarray]:
-        state, goals = self._state, self.goals
-        effector = state.effector[:, :3]
-        distance, terms, reward = self.task.rate(effector, goals, self.spaces.effort_share(state.effort))
+    def _masked(self, info: dict[str, np.ndarray]) -> dict[str, Any]:
+        """Return infos with the masks of Gymnasium: those of every row are there."""
         every = np.ones(self.num_envs, dtype=bool)
-        info: dict[str, Any] = {
-            "effector": effector.copy(),
-            "goal": goals.copy(),
-            "distance": distance,
-            "is_success": distance < self.task.success_distance,
-            **{f"reward_{name}": term for name, term in terms.items()},
-            "stable": self.backend.stable,
-        }
-        for name in ("displacement", "effort", "uncertainty", "trusted", "distrust", "converged"):
-            info[name] = getattr(state, name).copy()
-        if self._plants is not None:
-            zero = np.zeros(self.num_envs)
-            info |= {"plant_stiffness": self._stiffness[:, 0].copy(), "plant_cable_friction": zero}
-            info |= {"plant_delay": self._delay.copy(), "plant_noise": self._noise.copy()}
-            info |= {f"plant_{name}": np.full(self.num_envs, getattr(Plant, name)) for name in OF_DRIVES}
-        info |= {f"_{name}": every for name in tuple(info)}
-        return info, reward
+        return info | {f"_{name}": every for name in info}

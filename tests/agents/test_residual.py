@@ -64,7 +64,8 @@ def test_copies_correct_a_qp_of_their_own():
     twins = [pickle.loads(pickle.dumps(env)), copy.deepcopy(env)]
     expected = [env.step(np.full(2, 0.5))[0] for _ in range(2)]
     for twin in twins:
-        np.testing.assert_allclose([twin.step(np.full(2, 0.5))[0] for _ in range(2)], expected, atol=1e-7)
+        # The QP of a copy starts without the last solution; a unit in the last place of its displacement is 2e-7 here.
+        np.testing.assert_allclose([twin.step(np.full(2, 0.5))[0] for _ in range(2)], expected, atol=5e-7)
     envs = on("FingerReach", residual_scale=0.5).make_vec(2)
     envs.reset(seed=3)
     twins = [pickle.loads(pickle.dumps(envs)), copy.deepcopy(envs)]

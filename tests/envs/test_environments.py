@@ -133,7 +133,9 @@ def test_bounds_time_limit_and_info(identifier, options, episodes, action_mode):
     env.action_space.seed(3)
     for episode in range(episodes):
         observation, info = env.reset(seed=episode)
-        assert (env.unwrapped._unit_design == env.unwrapped.design_space.to_unit(env.unwrapped.design)).all()
+        assert (
+            env.unwrapped._episodes.unit_designs[0] == env.unwrapped.design_space.to_unit(env.unwrapped.design)
+        ).all()
         truncated = False
         steps = 0
         terminated = False

@@ -12,10 +12,12 @@ from gymnasium.utils.env_checker import check_env
 import softgym_envs
 from softgym_envs.envs import registration
 from softgym_envs.envs.env import SoftRobotEnv
+from softgym_envs.envs.random import RowRandom
 from softgym_envs.envs.registration import register_environment
 from softgym_envs.envs.tasks.reach import Reach
 from softgym_envs.envs.tasks.registry import TASKS, register_task
 from softgym_envs.envs.vector_env import SoftRobotVectorEnv
+from softgym_envs.errors import ConvergenceError
 from softgym_envs.robots.soft_finger import SoftFinger
 from softgym_envs.testing import Spike
 
@@ -91,14 +93,15 @@ def test_your_own_task_in_every_environment():
 
 
 @pytest.mark.parametrize(
-    ("drawn", "message"),
+    ("drawn", "kind", "message"),
     [
-        (np.zeros((1, 3)), r"sample of task 'drawn'.* paths of shape \(1, 1, 3\), got \(1, 3\)"),
-        (np.full((1, 5, 3), 0.05), r"horizon = 1, must return paths of shape \(1, 1, 3\), got \(1, 5, 3\)"),
-        (np.full((1, 1, 3), np.nan), "returned a goal that is not finite; kinematics gives NaN for commands without"),
+        (np.zeros((1, 3)), ValueError, r"sample of task 'drawn'.* paths of shape \(1, 1, 3\), got \(1, 3\)"),
+        (np.full((1, 5, 3), 0.05), ValueError, r"horizon = 1, must return paths of shape \(1, 1, 3\), got \(1, 5, 3\)"),
+        (np.full((1, 1, 3), np.inf), ValueError, "sample of task 'drawn' returned a goal that is infinite"),
+        (np.full((1, 1, 3), np.nan), ConvergenceError, "50 goals in a row of task 'drawn' are NaN, as kinematics is"),
     ],
 )
-def test_goals_that_a_task_draws_are_checked(drawn, message):
+def test_goals_that_a_task_draws_are_checked(drawn, kind, message):
     class Drawn(Reach):
         name = "drawn"
 
@@ -108,13 +111,44 @@ def test_goals_that_a_task_draws_are_checked(drawn, message):
     single = gymnasium.make("SoftGym/FingerReach-v0", task=Drawn)
     batch = gymnasium.make_vec("SoftGym/FingerReach-v0", num_envs=1, task=Drawn)
     for env in (single, batch):
-        with pytest.raises(ValueError, match=message):
+        with pytest.raises(kind, match=message):
             env.reset(seed=0)
 
 
-def test_batched_environments_need_a_surrogate():
-    with pytest.raises(ValueError, match=r"backend = 'fem' of robot 'spike' has no batched environment.*processes"):
-        SoftRobotVectorEnv(Spike)
+class Redrawn(Reach):
+    """Has goals in one half of the workspace only: those in the other are NaN."""
+
+    name = "redrawn"
+
+    def sample(self, rng, count, kinematics):
+        goals = super().sample(rng, count, kinematics)
+        return np.where(goals[:, :, 1:2] > 0.05, goals, np.nan)
+
+
+def test_goals_that_are_nan_are_drawn_again_row_by_row():
+    batch = gymnasium.make_vec("SoftGym/FingerReach-v0", num_envs=8, task=Redrawn)
+    single = gymnasium.make("SoftGym/FingerReach-v0", task=Redrawn)
+    plain = gymnasium.make_vec("SoftGym/FingerReach-v0", num_envs=8)
+    goals, others = (env.reset(seed=0)[1]["goal"] for env in (batch, plain))
+    assert 0 < (others[:, 1] <= 0.05).sum() < 8 and (goals[:, 1] > 0.05).all()
+    for k in range(8):
+        np.testing.assert_allclose(single.reset(seed=k)[1]["goal"], goals[k], atol=1e-7)
+
+
+def test_random_numbers_of_a_task_have_an_axis_of_episodes():
+    rng = RowRandom([np.random.default_rng(k) for k in (3, 4)])
+    drawn = [rng.uniform([0.0, 1.0], [2.0, 4.0], (2, 2)), rng.integers(9, size=2), rng.normal((2, 3))]
+    for k in range(2):
+        alone = np.random.default_rng(3 + k)
+        assert (drawn[0][k] == alone.uniform([0.0, 1.0], [2.0, 4.0])).all() and drawn[1][k] == alone.integers(9)
+        assert (drawn[2][k] == alone.standard_normal(3)).all()
+    with pytest.raises(ValueError, match=r"size = \(3, 2\) .* must begin with the number of episodes, 2"):
+        rng.uniform(0.0, 1.0, (3, 2))
+    with pytest.raises(AttributeError, match="have no 'choice'; allowed: uniform"):
+        rng.choice(3)
+
+
+def test_what_make_vec_makes():
     env = gymnasium.make_vec("SoftGym/Reach-v0", num_envs=2, robot=Spike, vectorization_mode="sync")
     assert env.reset(seed=0)[0].shape[0] == 2
     env.close()

@@ -22,7 +22,7 @@ def pair(identifier, count, **options):
     reference = gymnasium.make_vec(identifier, num_envs=count, **options).unwrapped
     env = TorchVectorEnv(identifier, count, device="cpu", **options)
     expected, _ = reference.reset(seed=0)
-    observation, info = env.reset(options={"design": reference.designs, "goal": reference._paths})
+    observation, info = env.reset(options={"design": reference.designs, "goal": reference.paths})
     assert env.single_observation_space == reference.single_observation_space
     assert env.single_action_space == reference.single_action_space
     assert observation.shape == expected.shape
@@ -168,7 +168,7 @@ def test_goals_have_the_same_distribution():
     reference.reset(seed=0)
     env = TorchVectorEnv("SoftGym/DiamondReach-v0", count, device="cpu", seed=0)
     _, info = env.reset()
-    a, b = reference._paths[:, 0], info["goal"].numpy()
+    a, b = reference.paths[:, 0], info["goal"].numpy()
     spread = a.std(axis=0)
     # means and quantiles within four standard errors
     assert (np.abs(a.mean(axis=0) - b.mean(axis=0)) < 4.0 * spread * np.sqrt(2.0 / count)).all()

@@ -1,5 +1,7 @@
 """The batched environment against the single one, and its adapter."""
 
+import copy
+
 import gymnasium
 import numpy as np
 import pytest
@@ -84,8 +86,8 @@ def test_given_designs_do_not_stay_where_others_are_sampled():
 
 
 def test_bad_input():
-    with pytest.raises(ValueError, match="fem.*surrogate"):
-        SoftRobotVectorEnv("finger", num_envs=2, backend="fem")
+    with pytest.raises(ValueError, match=r"vectorization_mode='sync'.*softgym rollout"):
+        gymnasium.make_vec("SoftGym/FingerReach-v0", num_envs=2, render_mode="rgb_array")
     env = gymnasium.make_vec("SoftGym/FingerReach-v0", num_envs=2)
     env.reset(seed=0, options={"reset_mask": [True, False]})
     with pytest.raises(ResetNeeded, match=r"before reset of sub-environments \[1\]"):
@@ -140,7 +142,7 @@ def test_stable_baselines_adapter():
         assert reward.dtype == np.float32
         assert done.all() == (step == 49)
         if step < 49:
-            state = env.env.unwrapped._state
+            state = env.env.unwrapped.state
             assert [info["effort"].tolist() for info in infos] == state.effort.tolist()
             assert all(set(info) >= {"distance", "is_success", "reward_effort"} for info in infos)
     for info in infos:
@@ -260,9 +262,9 @@ def test_lists_of_seeds_may_hold_none():
         env.reset(seed=seed)
         return env.unwrapped.goals.copy()
 
-    assert (goals([1, 2, 3]) == goals([1, 2, 3])).all() and (goals([1, 2, 3]) != goals([1, 2, 4])).all()
+    assert (goals([1, 2, 3]) == goals(1)).all() and (goals([1, 2, 3]) != goals([1, 2, 4])).all(axis=1)[2]
     first, second = [(goals(5), goals([1, None, 3]))[1] for _ in range(2)]
-    assert (first == second).all() and (goals([1, None, 3]) != first).all()
+    assert (first == second).all() and (goals([1, None, 3]) == first).all(axis=1).tolist() == [True, False, True]
     assert (goals([None] * 3) != goals([None] * 3)).all()
     with pytest.raises(ValueError, match="list of 3, got 2 seeds"):
         env.reset(seed=[1, 2])
@@ -271,3 +273,95 @@ def test_lists_of_seeds_may_hold_none():
 def test_an_unknown_autoreset_mode_names_the_known_ones():
     with pytest.raises(ValueError, match="autoreset_mode = 'later' is unknown; allowed: 'NextStep', 'SameStep'"):
         batch("later")
+
+
+SAME = {
+    "bodies": ("SoftGym/FingerReach-v0", {"sample_design": True}),
+    "plants": ("SoftGym/DiamondReach-v0", {"plant": {"noise": 0.01, "delay": (0, 2), "stiffness": (0.8, 1.2)}}),
+    "paths": ("SoftGym/FingerTrack-v0", {"task_options": {"jitter": 0.002}}),
+    "goals that are drawn again": ("SoftGym/GripperPinch-v0", {"task": "reach"}),
+    "beams": ("SoftGym/TetrapodReach-v0", {"sample_design": True, "plant": {"noise": 0.01}}),
+    "pushes": ("SoftGym/TetrapodCarry-v0", {"task_options": {"push": 2.0, "push_window": 2}}),
+}
+
+
+@pytest.mark.parametrize("case", SAME)
+def test_every_way_of_stepping_gives_the_episodes_of_the_seeds(case):
+    """Bodies, plants, goals, pushes and noise of row k are those of a single environment with its seed."""
+    identifier, options = SAME[case]
+    options = {"design_in_observation": True, **options}
+    singles = [gymnasium.make(identifier, **options, max_episode_steps=2) for _ in range(3)]
+    spec = gymnasium.spec(identifier)
+    kwargs = {**spec.kwargs, **options}
+    batch = SoftRobotVectorEnv(**kwargs, num_envs=3, max_episode_steps=2)
+    for seeds in ([7, 8, 9], [3, None, 11]):
+        alone = [env.reset(seed=seed) for env, seed in zip(singles, seeds, strict=True)]
+        together, info = batch.reset(seed=7 if seeds[0] == 7 else seeds)
+        for k, (observation, one) in enumerate(alone):
+            np.testing.assert_allclose(together[k], observation, atol=2e-5)
+            np.testing.assert_allclose(info["goal"][k], one["goal"], atol=1e-6)
+    for _ in range(2):  # the second step ends the episodes, and begins the next ones
+        action = np.full((3, batch.single_action_space.shape[0]), 0.4, dtype=np.float32)
+        alone = [env.step(action[k]) for k, env in enumerate(singles)]
+        together, reward, _, truncated, info = batch.step(action)
+        np.testing.assert_allclose(reward, [one[1] for one in alone], atol=2e-4)
+    assert truncated.all() and all(one[3] for one in alone)
+    for k, env in enumerate(singles):
+        np.testing.assert_allclose(info["final_obs"][k], alone[k][0], atol=5e-4)
+        observation, one = env.reset()
+        np.testing.assert_allclose(together[k], observation, atol=2e-5)
+        np.testing.assert_allclose(info["goal"][k], one["goal"], atol=1e-6)
+
+
+def test_only_the_rows_of_a_mask_take_their_seeds():
+    env = gymnasium.make_vec("SoftGym/FingerReach-v0", num_envs=3)
+    first = env.reset(seed=[4, 5, 6])[1]["goal"]
+    again = env.reset(seed=[4, 4, 4], options={"reset_mask": np.array([False, True, False])})[1]["goal"]
+    assert (again[[0, 2]] == first[[0, 2]]).all() and (again[1] == first[0]).all()
+
+
+def test_backends_without_a_batch_step_one_by_one():
+    """Any robot, task and backend in one process: here finite elements, as single environments give them."""
+    options = {"backend": "fem", "robot_options": {"element": "linear", "mesh_size": 0.015}}
+    env = SoftRobotVectorEnv("finger", "reach", 2, **options)
+    singles = [gymnasium.make("SoftGym/FingerReach-v0", **options) for _ in range(2)]
+    action, design = np.full((2, 2), 0.5), [{"length": 0.041}, {"length": 0.04}]
+    observation, _ = env.reset(seed=1, options={"design": design})
+    expected = [one.reset(seed=k + 1, options={"design": design[k]})[0] for k, one in enumerate(singles)]
+    np.testing.assert_allclose(observation, expected, atol=1e-7)
+    twin = copy.deepcopy(env)
+    observation, reward, *_, gradient = env.step_with_gradient(action)
+    expected = [one.step(action[k]) for k, one in enumerate(singles)]
+    np.testing.assert_allclose(observation, [one[0] for one in expected], atol=1e-7)
+    assert gradient.reward == pytest.approx(reward) and reward == pytest.approx([one[1] for one in expected])
+    ends = []
+    for change in (1e-3, -1e-3):
+        ends.append(copy.deepcopy(twin).step(action + np.array([change, 0.0]))[1])
+    np.testing.assert_allclose(gradient.action[:, 0], (ends[0] - ends[1]) / 2e-3, rtol=1e-3)
+    np.testing.assert_allclose(twin.step(action)[0], observation, atol=1e-7)
+
+
+def test_wrappers_that_change_observations_need_next_step():
+    from gymnasium.wrappers.vector import NormalizeObservation, NormalizeReward, RecordEpisodeStatistics
+
+    for mode, wrappers in (
+        ("NextStep", (NormalizeObservation, NormalizeReward, RecordEpisodeStatistics)),
+        ("SameStep", (NormalizeReward, RecordEpisodeStatistics)),
+    ):
+        for wrapper in wrappers:
+            env = wrapper(batch(mode))
+            env.reset(seed=0)
+            for _ in range(6):
+                env.step(env.action_space.sample())
+    with pytest.raises(ValueError, match="NEXT_STEP"):
+        NormalizeObservation(batch("SameStep"))
+
+
+def test_a_synchronous_batch_is_drawn():
+    env = gymnasium.make_vec(
+        "SoftGym/FingerReach-v0", num_envs=2, vectorization_mode="sync", render_mode="rgb_array", render_size=(64, 48)
+    )
+    env.reset(seed=0)
+    first, second = env.render()
+    assert first.shape == (48, 64, 3) and (first != second).any()
+    env.close()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import reduce
+from functools import partial, reduce
 from operator import mul
 from typing import Any, Protocol
 
@@ -13,23 +13,30 @@ import numpy as np
 
 from softgym_envs.backends.backend import PointForce, State
 from softgym_envs.envs.arrays import Array, namespace, pick_rows
+from softgym_envs.errors import ConvergenceError
 from softgym_envs.quantities import check_quantity
 from softgym_envs.robots.base import Robot
 from softgym_envs.robots.checks import plausible_force
 from softgym_envs.wording import decimal
+
+MAX_DRAWS = 50
+"""Number of goals without an equilibrium that are drawn in turn before `draw_paths` gives up."""
 
 Kinematics = Callable[[Array], Array]
 """Maps commands (B, n_a) to the effectors that they lead to [m], shape (B, 3), for the present bodies."""
 
 
 class Random(Protocol):
-    """Random numbers for tasks: a `numpy.random.Generator`, or its counterpart for tensors."""
+    """Random numbers for tasks, whose first axis is that of the episodes: each draws from a generator of its own.
+
+    Tensors have one generator for all (`TorchVectorEnv`).
+    """
 
     def uniform(self, low: Any, high: Any, size: Any, /) -> Array:
-        """Draw uniformly between ``low`` and ``high``."""
+        """Draw uniformly between ``low`` and ``high``, shape ``size`` = (count, ...)."""
 
-    def integers(self, low: int, *, size: int) -> Array:
-        """Draw integers from 0 to ``low - 1``."""
+    def integers(self, low: int, *, size: Any) -> Array:
+        """Draw integers from 0 to ``low - 1``, shape ``size`` = (count, ...)."""
 
 
 @dataclass(frozen=True)
@@ -92,24 +99,46 @@ def check_goals(goals: object, name: str, robot: Robot, leading: tuple[int, ...]
     return robot.check_point(name, array)
 
 
-def check_drawn(task: Task, paths: Array, count: int) -> Array:
-    """Return the paths that a task has drawn.
+def draw_paths(
+    task: Task, rows: Array, random: Callable[[Array], Random], kinematics: Callable[[Array, Array], Array]
+) -> Array:
+    """Return the goals that a task draws for some rows, shape (len(rows), p, 3); rows with NaN are drawn again.
+
+    Args:
+        task: the task.
+        rows: numbers of the rows.
+        random: returns the random numbers of some rows.
+        kinematics: maps rows and their commands (B, n_a) to effectors (B, 3) [m].
 
     Raises:
-        ValueError: unless they are finite and have the shape (count, p, 3), with p = 1 for a task with one goal.
+        ValueError: for paths of a wrong shape, or goals that are infinite.
+        ConvergenceError: if `MAX_DRAWS` draws in a row have NaN.
     """
-    shape = tuple(paths.shape)
-    longest = 1 if task.horizon == 1 else np.inf
-    if len(shape) != 3 or shape[0] != count or shape[2] != 3 or not 1 <= shape[1] <= longest:
-        wanted = f"({count}, {'1' if longest == 1 else 'p'}, 3)"
+    paths = _drawn(task, rows, random, kinematics)
+    for _ in range(MAX_DRAWS - 1):
+        lost = namespace(paths).isnan(paths).any(-1).any(-1)
+        if not lost.any():
+            return paths
+        paths[lost] = _drawn(task, rows[lost], random, kinematics)
+    raise ConvergenceError(
+        f"no goal can be drawn: {MAX_DRAWS} goals in a row of task '{task.name}' are NaN, as kinematics is for "
+        "commands without an equilibrium",
+        fraction=0.0,
+    )
+
+
+def _drawn(
+    task: Task, rows: Array, random: Callable[[Array], Random], kinematics: Callable[[Array, Array], Array]
+) -> Array:
+    paths = task.sample(random(rows), len(rows), partial(kinematics, rows))
+    shape, longest = tuple(paths.shape), 1 if task.horizon == 1 else np.inf
+    if len(shape) != 3 or shape[0] != len(rows) or shape[2] != 3 or not 1 <= shape[1] <= longest:
+        wanted = f"({len(rows)}, {'1' if longest == 1 else 'p'}, 3)"
         raise ValueError(
             f"sample of task '{task.name}', horizon = {task.horizon}, must return paths of shape {wanted}, got {shape}"
         )
-    if not np.isfinite(paths).all():
-        raise ValueError(
-            f"sample of task '{task.name}' returned a goal that is not finite; kinematics gives NaN for commands "
-            "without an equilibrium, which have to be drawn again"
-        )
+    if namespace(paths).isinf(paths).any():
+        raise ValueError(f"sample of task '{task.name}' returned a goal that is infinite")
     return paths
 
 
@@ -203,10 +232,12 @@ class Task(ABC):
     def sample(self, rng: Random, count: int, kinematics: Kinematics) -> Array:
         """Draw the goals of ``count`` episodes: paths [m], shape (count, p, 3); p = 1 for a fixed goal.
 
+        Episodes whose goals have NaN are drawn again.
+
         Args:
-            rng: the generator to draw from.
+            rng: random numbers, with a generator for each episode: their first axis is ``count``.
             count: number of episodes.
-            kinematics: maps commands (B, n_a) to effectors (B, 3) [m]; NaN for commands without an equilibrium.
+            kinematics: maps commands (count, n_a) to effectors (count, 3) [m]; NaN for commands without an equilibrium.
         """
 
     def goals(self, paths: Array, counts: Array, steps: Array) -> Array:

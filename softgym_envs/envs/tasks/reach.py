@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from softgym_envs.envs.arrays import Array, namespace
+from softgym_envs.envs.arrays import Array
 from softgym_envs.envs.tasks.base import Kinematics, Random, Task, check_goals, check_length
-from softgym_envs.errors import ConvergenceError
 from softgym_envs.robots.base import Robot
-
-MAX_DRAWS = 50
 
 
 class Reach(Task):
@@ -49,11 +46,4 @@ class Reach(Task):
         high = self.robot.upper
         low = self.robot.lower + self.command_low * (high - self.robot.lower)
         goals = kinematics(rng.uniform(low, high, (count, len(low))))
-        for _ in range(MAX_DRAWS):
-            lost = namespace(goals).isnan(goals[:, 0])  # draw again for commands without an equilibrium
-            if not lost.any():
-                return (goals + rng.uniform(-self.spread, self.spread, goals.shape))[:, None]
-            goals[lost] = kinematics(rng.uniform(low, high, (count, len(low))))[lost]
-        raise ConvergenceError(
-            f"no goal can be drawn: {MAX_DRAWS} random commands in a row have no equilibrium", fraction=0.0
-        )
+        return (goals + rng.uniform(-self.spread, self.spread, goals.shape))[:, None]

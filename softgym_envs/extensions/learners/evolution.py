@@ -17,7 +17,6 @@ from pydantic import Field, field_validator
 from softgym_envs.agents.config import TrainConfig
 from softgym_envs.agents.learners.base import Learner, Tensors, check_layers, check_weights
 from softgym_envs.config import Config
-from softgym_envs.envs.vector_env import SoftRobotVectorEnv
 from softgym_envs.extras import require
 
 
@@ -118,12 +117,6 @@ class EvolutionLearner(Learner):
         env, count = self.env, self.config.num_envs
         seed = int(np.random.default_rng([self.config.seed, self.step]).integers(2**31))
         observation, _ = env.reset(seed=[seed] * count)  # type: ignore[arg-type]
-        batch = env.unwrapped
-        if isinstance(batch, SoftRobotVectorEnv):  # its rows draw in turn from one generator
-            options: dict[str, Any] = {"goal": batch.paths[0]}
-            if batch.sampled_variables:
-                options["design"] = dict(zip(batch.design_space.names, batch.designs[0].tolist(), strict=True))
-            observation, _ = env.reset(options=options)
         return observation
 
     def _unpacked(self, weights: np.ndarray) -> Tensors:

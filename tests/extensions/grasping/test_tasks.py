@@ -190,6 +190,17 @@ def test_a_grasp_needs_contacts():
         SoftRobotEnv("finger", "grasp", backend="fem").reset(seed=0)
 
 
-def test_batched_environments_refuse_tasks_that_read_states():
-    with pytest.raises(ValueError, match="task 'grasp' reads forces of contacts"):
-        SoftRobotVectorEnv("finger", "grasp", 2)
+def test_batches_step_tasks_that_read_states_row_by_row():
+    batch = SoftRobotVectorEnv("grasping_finger", "grasp", 2, backend="surrogate")
+    singles = [SoftRobotEnv("grasping_finger", "grasp", backend="surrogate") for _ in range(2)]
+    observation, info = batch.reset(seed=6)
+    for k, env in enumerate(singles):
+        assert (env.reset(seed=6 + k)[0] == observation[k]).all()
+    for _ in range(3):
+        observation, reward, terminated, _, info = batch.step(np.ones((2, 1)))
+        for k, env in enumerate(singles):
+            expected, value, failed, _, alone = env.step(np.ones(1))
+            np.testing.assert_allclose(observation[k], expected, atol=1e-6)
+            assert reward[k] == pytest.approx(value, abs=1e-9) and terminated[k] == failed
+            np.testing.assert_allclose(info["contact_force"][k], alone["contact_force"], atol=1e-9)
+            assert info["reward_energy"][k] == pytest.approx(alone["reward_energy"])
