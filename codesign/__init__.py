@@ -10,7 +10,7 @@ from softgym_envs._lazy import lazy_exports
 
 if TYPE_CHECKING:
     from softgym_envs.codesign.config import StudyConfig as StudyConfig
-    from softgym_envs.codesign.metrics.courses import Course as Course
+    from softgym_envs.codesign.metrics.courses import ActuationPath as ActuationPath
     from softgym_envs.codesign.metrics.metric import Metric as Metric
     from softgym_envs.codesign.metrics.metric import metric as metric
     from softgym_envs.codesign.metrics.sources import Outcome as Outcome
@@ -33,7 +33,7 @@ __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
     {
         "config": ["StudyConfig"],
-        "metrics.courses": ["Course"],
+        "metrics.courses": ["ActuationPath"],
         "metrics.metric": ["Metric", "metric"],
         "metrics.sources": ["Outcome"],
         "report.page": ["write_report"],

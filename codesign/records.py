@@ -169,7 +169,7 @@ class FinalistTest(Record):
     goal_values: list[float] | None = None  # of the objective for each goal [SI], if it has such values
     error: str | None = None  # why the body cannot be simulated
     unknowns: int | None = None  # of its mesh, on finite elements
-    last_motion: float | None = None  # of the effector in the last step [m], if only ends are tested; see `Ends`
+    last_motion: float | None = None  # of the effector in the last step [m], if only ends are tested; see `FinalStates`
     numbers: list[int] | None = None  # of the goals among all unseen ones; None: the first ones
 
 

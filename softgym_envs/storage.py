@@ -1,4 +1,4 @@
-"""Files that are either complete or absent, and the location of caches."""
+"""Atomic file writes, and the location of caches."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ EPISODES = Source(
 )
 """A body and the evaluation of its controller, an `Outcome`."""
 STATES = Source("states", lambda body: body.course)
-"""States of a batch of bodies from rest to the full command, a `softgym_envs.codesign.metrics.courses.Course`."""
+"""States of a batch of bodies from rest to the full command, a `metrics.courses.ActuationPath`."""
 BODY = Source("body", lambda body: body.model)
 """The mechanical model of a body, a `softgym_envs.mechanics.model.MechanicalModel`."""
 DESIGN = Source("design", lambda body: dict(body.design))

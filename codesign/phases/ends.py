@@ -24,7 +24,7 @@ from softgym_envs.robots.base import Robot
 
 
 @dataclass(frozen=True)
-class Ends:
+class FinalStates:
     """Where the episodes of one body end.
 
     Attributes:
@@ -57,7 +57,7 @@ def run_ends(
     *,
     start: EnvironmentConfig,
     last_steps: int,
-) -> Ends:
+) -> FinalStates:
     """Return where an agent ends on finite elements: the inverse QP settled, a policy after its last steps.
 
     Args:
@@ -76,7 +76,7 @@ def run_ends(
     points = np.asarray(goals, dtype=float)[:, -1]
     commands = final_commands(agent, start, points, design)
     order = nearest_next(commands, environment.make_robot())
-    found = _Questions(environment, points, commands, order, dict(design))
+    found = _PendingGoals(environment, points, commands, order, dict(design))
     ended, unknowns = _settle(found) if agent == "qp" else _follow(found, agent, last_steps)
     columns = {name: np.array([getattr(ended[k], name) for k in range(len(points))]) for name in _COLUMNS}
     motions = [each.motion for each in ended.values() if each.motion is not None]
@@ -93,7 +93,7 @@ def run_ends(
         seconds=time.perf_counter() - began,
         cpu_seconds=time.process_time() - cpu,
     )
-    return Ends(evaluation, unknowns, max(motions, default=None))
+    return FinalStates(evaluation, unknowns, max(motions, default=None))
 
 
 def final_commands(
@@ -138,7 +138,7 @@ def nearest_next(commands: np.ndarray, robot: Robot) -> list[int]:
 
 
 @dataclass(frozen=True)
-class _Questions:
+class _PendingGoals:
     """Goals (k, 3) [m] on finite elements, the commands (k, n_a) to start from, and in which order to take them."""
 
     environment: EnvironmentConfig
@@ -153,7 +153,7 @@ class _Questions:
 
 @dataclass(frozen=True)
 class _End:
-    """Where one episode ends; see `Ends` for units."""
+    """Where one episode ends; see `FinalStates` for units."""
 
     distance: float
     success: bool
@@ -176,7 +176,7 @@ class _End:
 _COLUMNS = ("distance", "success", "effort", "largest", "effector")
 
 
-def _settle(asked: _Questions) -> tuple[dict[int, _End], int]:
+def _settle(asked: _PendingGoals) -> tuple[dict[int, _End], int]:
     """Return where the inverse QP ends by goal, and the number of unknowns."""
     robot = asked.environment.make_robot()
     success = asked.environment.make_task(robot).success_distance
@@ -195,7 +195,7 @@ def _settle(asked: _Questions) -> tuple[dict[int, _End], int]:
     return ends, statics.model.equations
 
 
-def _follow(asked: _Questions, agent: str | Path, last_steps: int) -> tuple[dict[int, _End], int]:
+def _follow(asked: _PendingGoals, agent: str | Path, last_steps: int) -> tuple[dict[int, _End], int]:
     """Return where a policy ends in closed loop by goal, and the number of unknowns."""
     act, env = make_agent(agent), asked.environment.make(sample_design=False)
     inner: Any = env.unwrapped

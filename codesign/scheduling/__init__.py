@@ -1,1 +1,1 @@
-"""Who runs which trial: queue, workers, storage and processes."""
+"""Scheduling of trials: queue, workers, storage and processes."""

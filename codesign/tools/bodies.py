@@ -14,7 +14,7 @@ from torch import Tensor
 from softgym_envs.backends.backend import Backend, State
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.backends.registry import make_backend
-from softgym_envs.codesign.metrics.courses import Course
+from softgym_envs.codesign.metrics.courses import ActuationPath
 from softgym_envs.codesign.metrics.metric import Metric, find_metric
 from softgym_envs.codesign.metrics.sources import STATES
 from softgym_envs.codesign.variables import split_values
@@ -118,9 +118,9 @@ class Body:
         return [backend.state] + [backend.step(k / self.steps * self.command) for k in range(1, self.steps + 1)]
 
     @cached_property
-    def course(self) -> Course:
+    def course(self) -> ActuationPath:
         """The states as tensors; raises as `states`."""
-        return Course(
+        return ActuationPath(
             displacement=_stack([state.displacement for state in self.states]),
             effort=_stack([state.effort for state in self.states]),
             effector=_stack([state.effector.ravel() for state in self.states]),
@@ -224,13 +224,13 @@ class LearnedBodies:
         self.steps = steps
         self.net = learned_model(robot, weights)
 
-    def course(self, values: Tensor) -> Course:
+    def course(self, values: Tensor) -> ActuationPath:
         """Return the states of complete designs (B, len(space))."""
         bodies, count = len(values), self.steps + 1
         part = torch.arange(count, dtype=torch.float64) / self.steps
         displacement = (part[:, None, None] * self.command).expand(count, bodies, -1)
         effort, effector, W = self.net(values.repeat(count, 1), displacement.reshape(count * bodies, -1))
-        return Course(
+        return ActuationPath(
             displacement=displacement,
             effort=effort.reshape(count, bodies, -1),
             effector=effector.reshape(count, bodies, -1),

@@ -90,7 +90,7 @@ class SurrogateMotion:
 
         Args:
             context: prepared bodies.
-            body: what the inertia knows of them, see `LearnedInertia.body`.
+            body: inertia features of each design, see `LearnedInertia.body`.
             state: where they are.
             command: the last command.
             target: the next one.

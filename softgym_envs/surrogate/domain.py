@@ -25,9 +25,9 @@ DISTRUST_REASONS = {
 }
 """The reasons in words: body or displacements lie outside the box of the training states; the uncertainty is above the
 limit; the actuators are so soft that the body may be about to buckle, or a body of superelements has; a learned
-superelement carries larger loads than those that it was learned under; an element of a beam bends farther than it can
-resist, which it would not do on a finer mesh; an estimate explains the readings of the sensors badly; a finger on
-learned chains would touch itself."""
+superelement carries larger loads than those that it was learned under; a beam element
+passed its stability limit, and the mesh should be refined; an estimate explains the readings of the sensors badly; a
+finger on learned chains would touch itself."""
 
 SLACK = 1e-3
 """Actuators that end farther beyond their commands than this are slack [half their range]."""
@@ -50,7 +50,7 @@ class Calibration:
     of the box. The default bounds the error by the spread itself.
 
     Attributes:
-        floor: spread that means nothing: members of an ensemble share some errors [m].
+        floor: noise floor of the ensemble standard deviation: members share some errors [m].
         power: how the error grows with the spread.
         inside: factor of bodies far from the bounds of all design variables.
         faces: of bodies with one variable at its bound.

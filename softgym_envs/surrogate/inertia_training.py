@@ -90,7 +90,7 @@ def fit_inertia(
     Args:
         robot: a robot without contact and bonds.
         bodies: how many are drawn; one of eight is left out of the fit to test it.
-        states: random commands per body, beside rest.
+        states: random commands per design, in addition to rest.
         degree: of the polynomials.
         workers: processes.
         progress: show a progress bar.

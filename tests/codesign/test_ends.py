@@ -46,7 +46,7 @@ def body(diamond):
 
 @pytest.fixture(scope="module")
 def run(diamond, body):
-    """Function ``run(agent) -> Ends``: on finite elements."""
+    """Function ``run(agent) -> FinalStates``: on finite elements."""
     design, goals = body
     return lambda agent: ends.run_ends(agent, diamond.on("fem"), goals, design, start=diamond, last_steps=4)
 

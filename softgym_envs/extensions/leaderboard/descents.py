@@ -45,7 +45,8 @@ class SettledCost:
     """Mean distance to the search goals at rest under the inverse QP, divided by that of the baseline, with gradient.
 
     At rest no small change of the commands brings the effector closer, so the derivative of the distance in the design
-    is that at constant displacements, less what slack actuators give way, whose efforts stay zero (envelope theorem).
+    is that at constant displacements, minus the displacement of slack actuators, whose efforts stay zero (envelope
+    theorem).
     A goal that is reached has a derivative of zero.
 
     Args:

@@ -147,12 +147,12 @@ class InheritanceOptimiser:
         self._population: list[tuple[float, np.ndarray, Path | None]] = []
         self._point = np.zeros(len(problem.variables))
         self._asked = 0
-        #: Policy that the training of the body asked for last begins with; None: that of the problem.
+        #: Policy that the training of the most recently proposed design begins with; None: that of the problem.
         self.initial: Path | None = None
 
     @property
     def keep(self) -> Path:
-        """Folder in which the policy of the body asked for last is kept."""
+        """Folder in which the policy of the most recently proposed design is kept."""
         return self._folder.path / str(self._asked)
 
     def ask(self) -> Mapping[str, float]:

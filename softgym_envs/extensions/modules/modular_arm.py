@@ -45,7 +45,7 @@ KINDS = ("leaf_x", "leaf_y", "block")
 
 
 class _Shape(NamedTuple):
-    """What the arm knows of the shape of a module.
+    """Module geometry used by the arm.
 
     Attributes:
         dimensions: what ``length``, ``width`` and ``depth`` of a cell set if its kind is part of the design.

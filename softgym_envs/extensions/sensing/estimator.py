@@ -299,7 +299,7 @@ class Estimator:
             covariance = self.belief.covariance[:n_a, :n_a]
             actuators = replace(actuators, mean=self.belief.mean[:n_a], covariance=covariance)
         self.load = load
-        self.belief = actuators if load is None else actuators.beside(load.prior)
+        self.belief = actuators if load is None else actuators.joined_with(load.prior)
         self._drift = np.zeros(len(self.belief.mean))
         self._drift[n_a:] = self.noise.drift * np.sqrt(np.diag(self.belief.covariance))[n_a:]
         self._mixture: Mixture | None = None
@@ -448,7 +448,7 @@ class Estimator:
             branches = [each.consistent(unsure) for each in (branch, self._branch(other, before, evidence))]
         mixture = branches[0].mixture
         for each in branches[1:]:
-            mixture = mixture.beside(each.mixture)
+            mixture = mixture.joined_with(each.mixture)
         parts = [(each.mixture, each.base, each.slopes) for each in branches]
         moments = joint_moments(parts)
         if (bend := self._bend(estimate, moments)) is not None:

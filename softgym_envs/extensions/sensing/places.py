@@ -141,7 +141,7 @@ class Mixture:
             - (density * (ratio + density))[:, None, None] * gain[:, :, None] * gain[:, None],
         )
 
-    def beside(self, other: Mixture) -> Mixture:
+    def joined_with(self, other: Mixture) -> Mixture:
         """Return the sum of two distributions over the same places, with a normal one at each place."""
         logarithms = np.logaddexp(self.logarithms, other.logarithms)
         shares = [np.exp(part.logarithms - logarithms)[:, None] for part in (self, other)]

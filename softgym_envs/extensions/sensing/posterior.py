@@ -27,7 +27,7 @@ class Gaussian:
     low: np.ndarray
     high: np.ndarray
 
-    def beside(self, other: Gaussian) -> Gaussian:
+    def joined_with(self, other: Gaussian) -> Gaussian:
         """Return the distribution of these parameters and those of another one, independent of each other."""
         n, m = len(self.mean), len(other.mean)
         covariance = np.zeros((n + m, n + m))

@@ -1,4 +1,4 @@
-"""Many bodies of beams, each in a state of its own, that one compiled call moves one after the other."""
+"""Steps many beam robots in one compiled call."""
 
 from __future__ import annotations
 

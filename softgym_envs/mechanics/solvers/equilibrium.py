@@ -1,4 +1,4 @@
-"""What static solvers take and return."""
+"""Inputs and results of the static solvers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""States on which learned models are judged: FEM equilibria under given commands, in strata of their own.
+"""Stratified FEM test states for surrogates: equilibria under given commands.
 
 Environments and optimisers meet a model at commands, and optimisers end at the boundary of the design box. A test set
 of random bodies has hardly any of the states that matter to them, so each kind is drawn on its own.

@@ -94,7 +94,7 @@ def test_a_cut_distribution_has_the_moments_of_its_samples():
 def test_both_sides_of_a_cut_make_up_the_whole():
     before, _ = mixture(np.array([[0.3], [0.9]]))
     slope = np.array([2.0, -1.0])
-    whole = before.cut(0.3, slope).beside(before.cut(-0.3, -slope))
+    whole = before.cut(0.3, slope).joined_with(before.cut(-0.3, -slope))
     for name in ("logarithms", "means", "covariances"):
         np.testing.assert_allclose(getattr(whole, name), getattr(before, name), atol=1e-12)
 

@@ -282,7 +282,7 @@ class ChainHand:
     def compliance(self) -> tuple[np.ndarray, bool]:
         """Return W (6, 6) between the drives and the box, for the loading direction and with the inertia of the step.
 
-        Its rows for y are zero, because nothing moves across the plane. The second value tells whether it exists.
+        Its rows for y are zero, because nothing moves across the plane. Second value: whether the matrix exists.
         """
         memory = self.memory
         finger, below = self._parts(memory.before.copy(), memory.table_before.copy())

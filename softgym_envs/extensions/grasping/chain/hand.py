@@ -194,7 +194,7 @@ def eliminate(
     """Assemble a hand and eliminate the chains; return its energy and whether what was eliminated is definite.
 
     The coordinates that stay are the angles of both servos, the height of the hand and the pose of the box. Filled are
-    the reduced gradient (6,) and tangent ``reduced`` (6, 6), ``solved`` (2, N, 3, 5), which says how the nodes give way
+    the reduced gradient (6,) and tangent ``reduced`` (6, 6), ``solved`` (2, N, 3, 5), sensitivity of the nodes
     to the pose (3 columns), to the angle and, with the opposite sign, to the forces on them, and the derivatives
     ``ends`` (2, 3) of the driven nodes by their angles, in the frame of the box.
     """

@@ -72,10 +72,10 @@ class ContactQP(InverseQP):
         -coefficient f <= g <= coefficient f,
         s > 0 only where g = -coefficient f,    s < 0 only where g = coefficient f,
 
-    so points stick or slide as Coulomb's law says, along two directions that do not know of each other: friction of
-    both at once can be larger by up to the root of two. The first direction is that of the friction force. Without such
-    rows, friction forces stay as they are. So the result is right where nothing changes any more, and friction that
-    follows the step counts in the next one; `ContactControl` corrects the changes of forces for it.
+    so points stick or slide as Coulomb's law says, along two independent tangential directions (a friction pyramid):
+    friction of both at once can be larger by up to the root of two. The first direction is that of the friction force.
+    Without such rows, friction forces stay as they are. So the result is right where nothing changes any more, and
+    friction that follows the step counts in the next one; `ContactControl` corrects the changes of forces for it.
 
     Where friction leaves several states possible for the same commands, the result is the best of them.
 

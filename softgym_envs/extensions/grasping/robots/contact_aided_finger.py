@@ -139,7 +139,7 @@ class ContactAidedFinger(MeshedRobot):
 
     @property
     def alone(self) -> ContactAidedFinger:
-        """The same finger without anything to touch: what learned chains stand for."""
+        """The same finger without anything to touch: the robot that chain surrogates approximate."""
         own = inspect.signature(ContactAidedFinger).parameters
         return ContactAidedFinger(**{name: value for name, value in self.mechanics_key.items() if name in own})
 
