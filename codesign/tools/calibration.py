@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +56,7 @@ def calibrate(
 
 def _calibrate(config: CalibrationConfig, data: Measurements) -> CalibrationResult:
     began = time.perf_counter()
+    data, held_out = data.split(config.held_out)
     misfit = make_misfit(config, data, config.backend)
     parameters = misfit.parameters
     if config.method == "tpe":
@@ -67,8 +69,11 @@ def _calibrate(config: CalibrationConfig, data: Measurements) -> CalibrationResu
         best = refined = fit_gradient(misfit, best.found)
     values = {**parameters.box.reference, **best.found}
     point = parameters.point(values)
+    theory = linear_theory(misfit, values, config.level or 0.95)
     intervals = None
-    if config.level is not None:
+    if config.level is not None and config.intervals == "linear":
+        intervals = theory.intervals
+    elif config.level is not None:
         intervals = {name: profile_interval(misfit, values, name, config.level) for name in config.fit}
     return CalibrationResult(
         design={name: value for name, value in values.items() if name not in config.nuisances},
@@ -81,16 +86,23 @@ def _calibrate(config: CalibrationConfig, data: Measurements) -> CalibrationResu
         refined=refined,
         measured_states=len(data),
         seconds=time.perf_counter() - began,
+        correlations=theory.correlations,
+        held_out_states=len(held_out),
+        held_out_errors=make_misfit(config, held_out, misfit.backend, fits=False).errors(point)
+        if len(held_out)
+        else {},
+        plant=parameters.instrument(values, data.driven).plant([a.name for a in misfit.robot.actuators]),
+        notes=theory.notes,
     )
 
 
-def make_misfit(config: CalibrationConfig, data: Measurements, backend: str) -> Misfit:
-    """Return the residuals of a configuration on a backend; raises as `Misfit`."""
+def make_misfit(config: CalibrationConfig, data: Measurements, backend: str, *, fits: bool = True) -> Misfit:
+    """Return the residuals of a configuration on a backend; raises and arguments as `Misfit`."""
     robot = config.make_robot()
     parameters = Parameters(robot, config.box(), config.nuisances)
     if backend == "fem":
-        return FEMMisfit(robot, parameters, data, config.make_robot)
-    return LearnedMisfit(robot, parameters, data, config.weights)
+        return FEMMisfit(robot, parameters, data, config.make_robot, fits=fits)
+    return LearnedMisfit(robot, parameters, data, config.weights, fits=fits)
 
 
 def fit_gradient(misfit: Misfit, start: Mapping[str, float]) -> Fit:
@@ -201,6 +213,73 @@ def profile_interval(misfit: Misfit, values: Mapping[str, float], name: str, lev
         end = best.copy()
         end[k] = outside
         ends.append(parameters.values(end)[name])
+    return min(ends), max(ends)
+
+
+CORRELATED, OPEN = 0.95, 0.5
+"""Correlation of two parameters above which only their combination is known; half-width of an interval over that of the
+bounds above which a parameter is not known."""
+
+
+@dataclass(frozen=True)
+class LinearTheory:
+    """What the derivatives at the optimum say about the parameters.
+
+    Attributes:
+        intervals: by name [SI], within the bounds.
+        correlations: of their errors, by both names; None if a parameter, or a combination, changes nothing.
+        notes: which parameters these data do not determine, in sentences.
+    """
+
+    intervals: dict[str, tuple[float, float]]
+    correlations: dict[str, dict[str, float]] | None
+    notes: list[str]
+
+
+def linear_theory(misfit: Misfit, values: Mapping[str, float], level: float) -> LinearTheory:
+    """Return intervals, correlations and what is not determined, from the derivatives at ``values``.
+
+    For noise of one unknown size, independent in all measured numbers; errors of the model count as noise.
+    """
+    from scipy.stats import t
+
+    parameters = misfit.parameters
+    names, best = parameters.names, np.clip(parameters.point(values), -1.0, 1.0)
+    J = misfit.jacobian(best)
+    freedom = misfit.count - len(best)
+    _, sizes, directions = np.linalg.svd(J, full_matrices=False)
+    if not sizes[-1] > 1e-8 * sizes[0]:
+        least = directions[-1]
+        part = [name for name, share in zip(names, least, strict=True) if abs(share) > 0.1]
+        note = f"a combination of {', '.join(part)} changes nothing that was measured"
+        return LinearTheory({name: _ends(parameters, best, k, 2.0) for k, name in enumerate(names)}, None, [note])
+    covariance = np.linalg.inv(J.T @ J) * misfit.cost(best) / freedom
+    errors = np.sqrt(np.diag(covariance))
+    width = float(t.ppf(0.5 + 0.5 * level, freedom)) * errors
+    correlation = covariance / np.outer(np.maximum(errors, 1e-300), np.maximum(errors, 1e-300))
+    notes = [
+        f"these data hardly determine {name}: its {100 * level:g} % interval is {100 * w:.0f} % of its range"
+        for name, w in zip(names, width, strict=True)
+        if w > OPEN
+    ]
+    notes += [
+        f"{names[i]} and {names[k]} are known together rather than each alone: correlation {correlation[i, k]:.2f}"
+        for i in range(len(names))
+        for k in range(i)
+        if abs(correlation[i, k]) > CORRELATED
+    ]
+    table = {a: {b: float(correlation[i, k]) for k, b in enumerate(names)} for i, a in enumerate(names)}
+    intervals = {name: _ends(parameters, best, k, width[k]) for k, name in enumerate(names)}
+    return LinearTheory(intervals, table, notes)
+
+
+def _ends(parameters: Parameters, best: np.ndarray, k: int, width: float) -> tuple[float, float]:
+    """Return the ends [SI] of an interval of parameter ``k`` with a half-width in coordinates, within the bounds."""
+    ends = []
+    for sign in (-1.0, 1.0):
+        end = best.copy()
+        end[k] = np.clip(best[k] + sign * width, -1.0, 1.0)
+        ends.append(parameters.values(end)[parameters.names[k]])
     return min(ends), max(ends)
 
 

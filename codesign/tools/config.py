@@ -11,7 +11,7 @@ from softgym_envs.codesign.metrics.metric import Metric, find_metric, metric_nam
 from softgym_envs.codesign.sampling import SamplerConfig
 from softgym_envs.codesign.tools.bodies import Evaluator, LearnedBodies, check_derivatives, check_metrics, full_command
 from softgym_envs.codesign.tools.box import Box
-from softgym_envs.codesign.tools.nuisance import ContactConfig, OffsetConfig, check_nuisances
+from softgym_envs.codesign.tools.nuisance import AnyNuisance, check_nuisances
 from softgym_envs.codesign.variables import OptionRange, change_options
 from softgym_envs.config import BesideConfig, Config
 from softgym_envs.robots.base import Robot
@@ -254,35 +254,38 @@ class CalibrationConfig(RobotConfig):
     Attributes:
         name: name of the results' folder.
         fit: design variables to fit, and robot options as ``robot.<option>``.
-        nuisances: unknowns of the measurement that are fitted too, by name: offsets of columns and the distance of an
-            object.
+        nuisances: unknowns of the measurement that are fitted too, by name: what the drives do (gain, offset, backlash,
+            compliance, friction), the sensor's frame, offsets of columns and the distance of an object.
         data: CSV or JSON file of measurements, with a column for each actuator and effector coordinate.
         method: ``"gradient"`` (least squares) or ``"tpe"`` (Optuna).
         starts: first values ``{name: value}`` of variables and nuisance parameters, one fit from each; default: the
             reference design.
         trials: number of evaluations (``tpe``).
         refine: fit once more on FEM, from the best fit on the surrogate.
+        held_out: names of trials that are not fitted but predicted, from a column ``trial`` of the data.
         level: confidence level of the intervals; None for no intervals.
+        intervals: ``"profile"`` (of the fitted variables, by their profile likelihood) or ``"linear"`` (of all
+            parameters, from the derivatives at the optimum, which costs nothing more).
         seed: seed of ``tpe``.
     """
 
     name: FolderName
     fit: tuple[str, ...] = Field(min_length=1)
-    nuisances: dict[str, Annotated[OffsetConfig | ContactConfig, Field(discriminator="kind")]] = Field(
-        default_factory=dict
-    )
+    nuisances: dict[str, Annotated[AnyNuisance, Field(discriminator="kind")]] = Field(default_factory=dict)
     data: Annotated[str, BesideConfig()]
     method: Literal["gradient", "tpe"] = "gradient"
     starts: tuple[dict[str, float], ...] = Field(default=({},), min_length=1)
     trials: int = Field(default=250, ge=1)
     refine: bool = False
+    held_out: tuple[str, ...] = ()
     level: float | None = Field(default=0.95, gt=0.0, lt=1.0)
+    intervals: Literal["profile", "linear"] = "profile"
     seed: int = Field(default=0, ge=0)
 
     @model_validator(mode="after")
     def _consistent(self) -> CalibrationConfig:
         box = self.box()
-        check_nuisances(self.nuisances, self.make_robot(), self.fit)
+        check_nuisances(self.nuisances, self.make_robot(), self.fit, self.backend)
         if box.options and self.backend != "fem":
             raise ValueError(f"fit: the option '{box.options[0]}' needs backend 'fem', got '{self.backend}'")
         for start in self.starts:

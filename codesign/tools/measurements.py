@@ -30,6 +30,7 @@ class Measurements:
     displacement: np.ndarray  # of the actuators [m, ...], shape (N, n_a)
     effort: np.ndarray  # of the actuators [N, ...], shape (N, n_a)
     effector: np.ndarray  # positions [m], shape (N, 3 k) for k effectors
+    trial: tuple[str, ...] = ()  # name of the trial of each row; empty if there is one
 
     def __len__(self) -> int:
         return len(self.effector)
@@ -38,6 +39,30 @@ class Measurements:
     def command(self) -> np.ndarray:
         """The imposed displacements or efforts, shape (N, n_a)."""
         return self.displacement if self.driven == "displacement" else self.effort
+
+    @property
+    def trials(self) -> tuple[str, ...]:
+        """Names of the trials in their order."""
+        return tuple(dict.fromkeys(self.trial))
+
+    def part(self, rows: np.ndarray) -> Measurements:
+        """Return the rows of a mask (N,)."""
+        trial = tuple(name for name, kept in zip(self.trial, rows, strict=bool(self.trial)) if kept)
+        return Measurements(self.driven, self.displacement[rows], self.effort[rows], self.effector[rows], trial)
+
+    def split(self, held_out: Sequence[str]) -> tuple[Measurements, Measurements]:
+        """Return the rows to fit and those of the named trials.
+
+        Raises:
+            DataError: for a name that is no trial, or if nothing is left to fit.
+        """
+        for name in held_out:
+            if name not in self.trial:
+                raise DataError(unknown_name("trial", name, self.trials))
+        kept = np.array([name not in held_out for name in self.trial]) if self.trial else np.ones(len(self), dtype=bool)
+        if not kept.any():
+            raise DataError("held_out names every trial: nothing is left to fit")
+        return self.part(kept), self.part(~kept)
 
     def with_noise(self, relative: float, rng: np.random.Generator) -> Measurements:
         """Return a copy with Gaussian noise on the measured columns, not on the imposed ones.
@@ -69,6 +94,7 @@ def read_measurements(path: str | Path, robot: Robot) -> Measurements:
     A CSV file has a header; a JSON file is a list of records, or an object of columns. The columns are
     ``<actuator>_displacement`` or ``<actuator>_effort`` of every actuator, and those of ``<effector>_x``, ``_y`` and
     ``_z`` that were measured. With displacements and efforts, the displacements were imposed and the efforts measured.
+    A column ``trial`` names the trial of each row; the rows of a trial follow each other in time.
 
     Args:
         path: file name that ends with .csv or .json.
@@ -97,8 +123,11 @@ def write_measurements(path: str | Path, robot: Robot, data: Measurements) -> No
     kept = ~np.isnan(table).any(axis=0)
     with atomic_write(path, "w") as stream:
         writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow([name for name, keep in zip(names, kept, strict=True) if keep])
-        writer.writerows([[repr(float(value)) for value in row] for row in table[:, kept]])
+        trial = [[name] for name in data.trial] or [[]] * len(data)
+        writer.writerow([*(["trial"] if data.trial else []), *np.array(names)[kept]])
+        writer.writerows(
+            [*t, *(repr(float(value)) for value in row)] for t, row in zip(trial, table[:, kept], strict=True)
+        )
 
 
 def measure(
@@ -179,6 +208,7 @@ def _read_json(path: Path) -> dict[str, list]:
 def _checked(path: Path, table: dict[str, list], robot: Robot) -> Measurements:
     displacement, effort, effector = columns_of(robot)
     where = f"measurements '{path}'"
+    trial = tuple(str(name) for name in table.pop("trial", ()))
     found = _numbers(where, table, [*displacement, *effort, *effector])
     driven: Literal["displacement", "effort"]
     if all(name in table for name in displacement):
@@ -203,7 +233,7 @@ def _checked(path: Path, table: dict[str, list], robot: Robot) -> Measurements:
     def block(names: list[str]) -> np.ndarray:
         return np.column_stack([found[name] for name in names])
 
-    data = Measurements(driven, block(displacement), block(effort), block(effector))
+    data = Measurements(driven, block(displacement), block(effort), block(effector), trial)
     _check_imposed(where, data, robot)
     return data
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,9 @@ from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.backends.surrogate import solve_displacements, solve_efforts
 from softgym_envs.codesign.tools.bodies import RobotMaker, learned_model
 from softgym_envs.codesign.tools.contact import Plane, step_towards_plane
-from softgym_envs.codesign.tools.measurements import Measurements
+from softgym_envs.codesign.tools.instrument import Instrument
+from softgym_envs.codesign.tools.measurements import Measurements, columns_of
+from softgym_envs.codesign.tools.nuisance import ContactConfig, FrameConfig, FrictionConfig, OffsetConfig
 from softgym_envs.codesign.tools.parameters import Parameters
 from softgym_envs.codesign.variables import split_values
 from softgym_envs.errors import ConfigError, ConvergenceError, DataError
@@ -25,14 +28,18 @@ class Misfit(ABC):
     """Residuals of a body against measurements, each relative to the size of what was measured.
 
     Effector coordinates are divided by the root mean square of their distances from their mean, efforts by their own
-    root mean square. There are ``count`` residuals, which were computed ``evaluations`` times so far.
+    root mean square. There are ``count`` residuals, which were computed ``evaluations`` times so far. A misfit that does
+    not fit, but predicts, takes any number of states.
 
     Raises:
         ConfigError: for an offset of a column that was not measured.
         DataError: if there are not more measured numbers than parameters, or they do not vary at all.
     """
 
-    def __init__(self, robot: Robot, parameters: Parameters, data: Measurements) -> None:
+    backend: str
+    """Name of the backend that predicts."""
+
+    def __init__(self, robot: Robot, parameters: Parameters, data: Measurements, *, fits: bool = True) -> None:
         self.robot, self.parameters, self.data = robot, parameters, data
         efforts = data.effort if data.driven == "displacement" else np.full_like(data.effort, np.nan)
         self._measured = np.column_stack([efforts, data.effector])
@@ -49,10 +56,12 @@ class Misfit(ABC):
         self.count = len(data) * len(kept)
         self.evaluations = 0
         self._last: tuple[np.ndarray, np.ndarray] | None = None
-        if not (self._scale > 0.0).all():
+        if not fits:
+            self._scale = np.ones(len(kept))
+        elif not (self._scale > 0.0).all():
             what = "there is only one measured state" if len(data) == 1 else "the measured states are all the same"
             raise DataError(f"{what}: nothing can be fitted")
-        if self.count <= len(parameters):
+        if fits and self.count <= len(parameters):
             raise DataError(
                 f"{self.count} measured numbers cannot determine {len(parameters)} parameters and their error"
             )
@@ -102,9 +111,16 @@ class LearnedMisfit(Misfit):
     """
 
     def __init__(
-        self, robot: Robot, parameters: Parameters, data: Measurements, weights: str | Path | None = None
+        self,
+        robot: Robot,
+        parameters: Parameters,
+        data: Measurements,
+        weights: str | Path | None = None,
+        *,
+        fits: bool = True,
     ) -> None:
-        super().__init__(robot, parameters, data)
+        super().__init__(robot, parameters, data, fits=fits)
+        self.backend = "surrogate"
         self.net = learned_model(robot, weights)
         self._unilateral = robot.unilateral
         self._reached = np.zeros(data.command.shape)
@@ -179,43 +195,158 @@ class LearnedMisfit(Misfit):
 
 
 class FEMMisfit(Misfit):
-    """Residuals of finite elements, with derivatives by finite differences."""
+    """Residuals of finite elements.
+
+    Derivatives by what drives and sensors do are exact, from ``W``; those by the body, its options, friction and the
+    distance of a plane are finite differences.
+    """
 
     difference = 1e-4  # in coordinates
 
     def __init__(
-        self, robot: Robot, parameters: Parameters, data: Measurements, make_robot: RobotMaker | None = None
+        self,
+        robot: Robot,
+        parameters: Parameters,
+        data: Measurements,
+        make_robot: RobotMaker | None = None,
+        *,
+        fits: bool = True,
     ) -> None:
-        super().__init__(robot, parameters, data)
+        super().__init__(robot, parameters, data, fits=fits)
+        self.backend = "fem"
         self._make_robot = make_robot
         self._options: dict[str, float] = {}
+        self._solved: tuple[np.ndarray, _Solved] | None = None
 
     def readings(self, point: np.ndarray) -> np.ndarray:
-        values = self.parameters.values(point)
-        quantities = self.parameters.quantities(torch.as_tensor(np.asarray(point, dtype=float)[None]))
-        offsets, n = quantities.offsets[0].numpy(), self._actuators
-        imposed = offsets[:n] if self.data.driven == "displacement" else offsets[n : 2 * n]
-        variables, options = split_values(values)
-        if options != self._options:
-            assert self._make_robot is not None
-            self.robot, self._options = self._make_robot(options), options
-        backend = FEMBackend(self.robot, {name: variables[name] for name in self.parameters.box.space.names})
-        rest = backend.state.effector[0]
-        rows = []
-        for command in self.data.command - imposed:
-            if quantities.distance is None:
-                state = backend.step(command, self.data.driven)
-            else:
-                assert self.parameters.normal is not None
-                plane = Plane(float(quantities.distance), self.parameters.normal)
-                state = step_towards_plane(backend, command, self.data.driven, plane, rest)
-            rows.append(np.concatenate([state.effort, state.effector.ravel()]))
-        return np.array(rows) + offsets[n:]
+        instrument, offsets = self._instrument(point)
+        solved = self._solve(point)
+        return np.column_stack([solved.effort, instrument.seen(solved.effector)]) + offsets
 
     def jacobian(self, point: np.ndarray) -> np.ndarray:
-        base, columns = self.residuals(point), []
-        for k, value in enumerate(point):
+        base = self.residuals(point)
+        exact = self._exact(point)
+        columns = []
+        for k, (name, value) in enumerate(zip(self.parameters.names, point, strict=True)):
+            if name in exact:
+                columns.append((exact[name][:, self._columns] / self._scale).ravel() * self.parameters.slope(name))
+                continue
             moved = np.array(point, dtype=float)
             moved[k] += self.difference if value < 0.0 else -self.difference
             columns.append((self.residuals(moved) - base) / (moved[k] - value))
         return np.stack(columns, axis=1)
+
+    def _instrument(self, point: np.ndarray) -> tuple[Instrument, np.ndarray]:
+        """Return drives and frame of the sensor, and the offsets of the measured columns (n_a + n_e,)."""
+        values = self.parameters.values(point)
+        quantities = self.parameters.quantities(torch.as_tensor(np.asarray(point, dtype=float)[None]))
+        return self.parameters.instrument(values, self.data.driven), quantities.offsets[0].numpy()[self._actuators :]
+
+    def _solve(self, point: np.ndarray) -> _Solved:
+        """Return the states of the body at a point (p,)."""
+        if self._solved is not None and np.array_equal(self._solved[0], point):
+            return self._solved[1]
+        values = self.parameters.values(point)
+        instrument, _ = self._instrument(point)
+        distance = self.parameters.quantities(torch.as_tensor(np.asarray(point, dtype=float)[None])).distance
+        variables, options = split_values(values)
+        if options != self._options:
+            assert self._make_robot is not None
+            self.robot, self._options = self._make_robot(options), options
+        design = {name: variables[name] for name in self.parameters.box.space.names}
+        backend = FEMBackend(self.robot, design, cable_friction=instrument.friction)
+        # Set afterwards: the body at rest is that without a stretch of its cables.
+        backend.cable_compliance = instrument.compliance
+        rest = backend.state.effector[0]
+        commands, source, side = instrument.driven(self.data.command, self.data.trial)
+        states = []
+        for command in commands:
+            if distance is None:
+                states.append(backend.step(command, self.data.driven))
+            else:
+                assert self.parameters.normal is not None
+                plane = Plane(float(distance), self.parameters.normal)
+                states.append(step_towards_plane(backend, command, self.data.driven, plane, rest))
+        n = self._actuators
+        slopes = np.zeros((len(states), n + states[0].effector.size, n))
+        for slope, state in zip(slopes, states, strict=True):
+            W = state.condensed.W
+            if self.data.driven == "effort":
+                slope[:n], slope[n:] = np.eye(n), W.ea
+                continue
+            taut = np.flatnonzero(~state.slack)
+            held = np.linalg.inv(W.aa[taut[:, None], taut] + np.diag(instrument.compliance[taut]))
+            slope[taut[:, None], taut] = held
+            slope[n:, taut] = W.ea[:, taut] @ held
+        solved = _Solved(
+            effort=np.array([state.effort for state in states]),
+            effector=np.array([state.effector.ravel() for state in states]),
+            slopes=slopes,
+            source=source,
+            side=side,
+        )
+        self._solved = np.array(point, dtype=float), solved
+        return solved
+
+    def _exact(self, point: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the exact derivatives of the readings (N, n_a + n_e) by name of a nuisance parameter."""
+        names = columns_of(self.robot)
+        imposed = names[0 if self.data.driven == "displacement" else 1]
+        measured = [*names[1], *names[2]]
+        solved, (instrument, _) = self._solve(point), self._instrument(point)
+        n, count = self._actuators, len(self.data)
+        rotation, turned = instrument.rotation()
+        bodies = solved.effector.reshape(count, -1, 3)
+
+        def through(change: np.ndarray) -> np.ndarray:
+            """Return the change of the readings for a change of what the drives do (N, n_a)."""
+            moved = np.einsum("nij,nj->ni", solved.slopes, change)
+            moved[:, n:] = (moved[:, n:].reshape(count, -1, 3) @ rotation.T).reshape(count, -1)
+            return moved
+
+        found: dict[str, np.ndarray] = {}
+        touched = self.parameters.normal is not None
+        for name, nuisance in self.parameters.nuisances.items():
+            change = np.zeros((count, n))
+            if isinstance(nuisance, FrameConfig):
+                kind, axis = nuisance.part.split("_")
+                k = "xyz".index(axis)
+                slope = bodies @ turned[k].T if kind == "turn" else np.broadcast_to(np.eye(3)[k], bodies.shape)
+                found[name] = np.column_stack([np.zeros((count, n)), slope.reshape(count, -1)])
+            elif isinstance(nuisance, OffsetConfig) and nuisance.column not in imposed:
+                found[name] = np.zeros((count, len(measured)))
+                found[name][:, measured.index(nuisance.column)] = 1.0
+            elif touched or isinstance(nuisance, ContactConfig | FrictionConfig):
+                continue
+            elif isinstance(nuisance, OffsetConfig):
+                change[:, imposed.index(nuisance.column)] = -1.0
+                found[name] = through(change)
+            else:
+                at = [imposed.index(column) for column in nuisance.columns]
+                if nuisance.kind == "gain":
+                    change[:, at] = np.take_along_axis(self.data.command, solved.source, axis=0)[:, at]
+                elif nuisance.kind == "backlash":
+                    change[:, at] = solved.side[:, at]
+                else:
+                    change[:, at] = -solved.effort[:, at]
+                found[name] = through(change)
+        return found
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """States of a body under what its drives do.
+
+    Attributes:
+        effort: shape (N, n_a).
+        effector: in the body's frame [m], shape (N, n_e).
+        slopes: derivatives of both by what the drives do, shape (N, n_a + n_e, n_a).
+        source: see `Instrument.driven`.
+        side: see there.
+    """
+
+    effort: np.ndarray
+    effector: np.ndarray
+    slopes: np.ndarray
+    source: np.ndarray
+    side: np.ndarray

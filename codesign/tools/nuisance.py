@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
+from softgym_envs.codesign.tools.instrument import Instrument
 from softgym_envs.codesign.tools.measurements import columns_of
 from softgym_envs.config import Config
 from softgym_envs.errors import unknown_name
@@ -78,14 +79,81 @@ class ContactConfig(NuisanceConfig):
         return np.array(self.normal) / np.linalg.norm(self.normal)
 
 
-Nuisances = Mapping[str, OffsetConfig | ContactConfig]
+class GainConfig(NuisanceConfig):
+    """Drives that do a multiple of what was recorded: ``gain * recorded - offset``, before their play."""
+
+    kind: Literal["gain"]
+    columns: tuple[str, ...] = Field(min_length=1, description="imposed columns of the measurements")
 
 
-def check_nuisances(nuisances: Nuisances, robot: Robot, fitted: Sequence[str]) -> None:
-    """Check the names, columns and units of nuisance parameters.
+class BacklashConfig(NuisanceConfig):
+    """Drives with play: they stay while their command is within half its width."""
+
+    kind: Literal["backlash"]
+    columns: tuple[str, ...] = Field(min_length=1, description="imposed columns of the measurements")
+
+
+class ComplianceConfig(NuisanceConfig):
+    """Cables that stretch under tension, which then lacks at the body."""
+
+    kind: Literal["compliance"]
+    columns: tuple[str, ...] = Field(min_length=1, description="imposed columns of displacements")
+
+
+class FrictionConfig(NuisanceConfig):
+    """Coefficient of friction of all cables on their guides."""
+
+    kind: Literal["friction"]
+
+
+class FrameConfig(NuisanceConfig):
+    """The sensor's frame: turned about the axes x, y and z of the body in this order, then shifted."""
+
+    kind: Literal["frame"]
+    part: Literal["turn_x", "turn_y", "turn_z", "shift_x", "shift_y", "shift_z"]
+
+
+AnyNuisance = (
+    OffsetConfig | ContactConfig | GainConfig | BacklashConfig | ComplianceConfig | FrictionConfig | FrameConfig
+)
+Nuisances = Mapping[str, AnyNuisance]
+
+
+def make_instrument(values: Mapping[str, float], nuisances: Nuisances, robot: Robot, driven: str) -> Instrument:
+    """Return the drives and the sensor's frame for values of the nuisance parameters.
+
+    Args:
+        values: by name.
+        nuisances: by name.
+        robot: the measured robot.
+        driven: ``"displacement"`` or ``"effort"``, what was imposed.
+    """
+    names = columns_of(robot)[0 if driven == "displacement" else 1]
+    n = len(names)
+    gain, offset, backlash, compliance = np.ones(n), np.zeros(n), np.zeros(n), np.zeros(n)
+    turn, shift, friction = np.zeros(3), np.zeros(3), 0.0
+    for name, nuisance in nuisances.items():
+        value = values[name]
+        if isinstance(nuisance, OffsetConfig):
+            if nuisance.column in names:
+                offset[names.index(nuisance.column)] += value
+        elif isinstance(nuisance, GainConfig | BacklashConfig | ComplianceConfig):
+            array = {"gain": gain, "backlash": backlash, "compliance": compliance}[nuisance.kind]
+            array[[names.index(column) for column in nuisance.columns]] = value
+        elif isinstance(nuisance, FrictionConfig):
+            friction = value
+        elif isinstance(nuisance, FrameConfig):
+            kind, axis = nuisance.part.split("_")
+            (turn if kind == "turn" else shift)["xyz".index(axis)] = value
+    return Instrument(gain, offset, backlash, compliance, friction, turn, shift)
+
+
+def check_nuisances(nuisances: Nuisances, robot: Robot, fitted: Sequence[str], backend: str = "fem") -> None:
+    """Check the names, columns and units of nuisance parameters, and that a backend has them.
 
     Raises:
-        ValueError: for a name that a fitted variable has, an unknown column, a wrong unit, or a second contact.
+        ValueError: for a name that a fitted variable has, an unknown column, a wrong unit, a part that two parameters
+            describe, or one that needs finite elements on another backend.
     """
     displacement, effort, effector = columns_of(robot)
     units = {
@@ -93,16 +161,36 @@ def check_nuisances(nuisances: Nuisances, robot: Robot, fitted: Sequence[str]) -
         **{name: effort_unit(a.unit) for name, a in zip(effort, robot.actuators, strict=True)},
         **dict.fromkeys(effector, "m"),
     }
-    contacts = [name for name, nuisance in nuisances.items() if isinstance(nuisance, ContactConfig)]
-    if len(contacts) > 1:
-        raise ValueError(f"nuisances: '{contacts[0]}' and '{contacts[1]}' are both contacts; allowed: one")
+    taken: dict[str, str] = {}
     for name, nuisance in nuisances.items():
         if name in robot.design_space.names or name in fitted:
             raise ValueError(f"nuisances: '{name}' is a variable of the body; use another name")
-        unit = "m"
-        if isinstance(nuisance, OffsetConfig):
-            if nuisance.column not in units:
-                raise ValueError(f"nuisances: '{name}': {unknown_name('column', nuisance.column, units)}")
-            unit = units[nuisance.column]
+        if not isinstance(nuisance, OffsetConfig | ContactConfig) and backend != "fem":
+            raise ValueError(f"nuisances: '{name}' is a {nuisance.kind}, which needs backend 'fem', got '{backend}'")
+        columns, unit = _columns_and_unit(name, nuisance, units, [*displacement, *effort])
         if nuisance.unit != unit:
             raise ValueError(f"nuisances: '{name}': unit = '{nuisance.unit}' must be '{unit}'")
+        for part in columns:
+            kind = nuisance.kind if part == nuisance.kind else f"{nuisance.kind} of {part}"
+            if not isinstance(nuisance, OffsetConfig) and (other := taken.setdefault(kind, name)) != name:
+                raise ValueError(f"nuisances: '{other}' and '{name}' are both {kind}; allowed: one")
+
+
+def _columns_and_unit(
+    name: str, nuisance: AnyNuisance, units: Mapping[str, str], imposed: Sequence[str]
+) -> tuple[Sequence[str], str]:
+    """Return what a nuisance parameter describes, and its unit; raises ValueError for an unknown column."""
+    if isinstance(nuisance, OffsetConfig):
+        if nuisance.column not in units:
+            raise ValueError(f"nuisances: '{name}': {unknown_name('column', nuisance.column, units)}")
+        return [nuisance.column], units[nuisance.column]
+    if isinstance(nuisance, FrameConfig):
+        return [nuisance.part], "rad" if nuisance.part.startswith("turn") else "m"
+    if isinstance(nuisance, ContactConfig | FrictionConfig):
+        return [nuisance.kind], "m" if nuisance.kind == "contact" else "1"
+    allowed = [c for c in imposed if c.endswith("_displacement")] if nuisance.kind == "compliance" else imposed
+    for column in nuisance.columns:
+        if column not in allowed:
+            raise ValueError(f"nuisances: '{name}': {unknown_name('column', column, allowed)}")
+    unit = units[nuisance.columns[0]]
+    return nuisance.columns, {"gain": "1", "backlash": unit, "compliance": f"{unit}/N"}[nuisance.kind]

@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from softgym_envs.codesign.tools.box import Box
+from softgym_envs.codesign.tools.instrument import Instrument
 from softgym_envs.codesign.tools.measurements import columns_of
-from softgym_envs.codesign.tools.nuisance import ContactConfig, Nuisances, OffsetConfig
+from softgym_envs.codesign.tools.nuisance import ContactConfig, Nuisances, OffsetConfig, make_instrument
 from softgym_envs.robots.base import Robot
 
 
@@ -34,6 +35,7 @@ class Parameters:
 
     def __init__(self, robot: Robot, box: Box, nuisances: Nuisances | None = None) -> None:
         self.box = box
+        self.robot = robot
         self.nuisances = dict(nuisances or {})
         self.names = (*box.names, *self.nuisances)
         columns = [name for group in columns_of(robot) for name in group]
@@ -94,6 +96,15 @@ class Parameters:
             columns[column] = columns[column] + nuisances[name]
         distance = None if self._contact is None else nuisances[self._contact]
         return Quantities(self.design(point), torch.stack(columns, dim=1), distance)
+
+    def slope(self, name: str) -> float:
+        """Return the derivative of a nuisance parameter by its coordinate [its unit]."""
+        low, high = self.nuisances[name].bounds
+        return 0.5 * (high - low)
+
+    def instrument(self, values: Mapping[str, float], driven: str) -> Instrument:
+        """Return the drives and the sensor's frame for the values of all parameters; see `make_instrument`."""
+        return make_instrument(values, self.nuisances, self.robot, driven)
 
     def _nuisances(self, point: Tensor) -> dict[str, Tensor]:
         return {

@@ -87,7 +87,8 @@ class Fit(Record):
 class CalibrationResult(Record):
     """Result of a calibration: the best fit.
 
-    Intervals are those of the fitted variables, over all values of the other variables and the nuisance parameters.
+    Profile intervals are those of the fitted variables, over all values of the other variables and the nuisance
+    parameters; linear ones are those of all parameters.
     """
 
     design: dict[str, float]  # complete, with fitted robot options [SI]
@@ -100,3 +101,8 @@ class CalibrationResult(Record):
     refined: Fit | None  # on FEM
     measured_states: int
     seconds: float
+    correlations: dict[str, dict[str, float]] | None = None  # of the errors of all parameters; None if some do not act
+    held_out_states: int = 0
+    held_out_errors: dict[str, float] = field(default_factory=dict)  # as `errors`, of trials that were not fitted
+    plant: dict[str, dict[str, float] | float] = field(default_factory=dict)  # option of environments: what drives do
+    notes: list[str] = field(default_factory=list)  # what these data do not determine

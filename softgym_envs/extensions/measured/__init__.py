@@ -1,0 +1,1 @@
+"""Robots of other laboratories against their public recordings: `softgym validate`."""
