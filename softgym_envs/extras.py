@@ -19,6 +19,7 @@ EXTRAS = {
     "minari": ("minari", "h5py", "jax"),
     "design": ("SALib",),
     "benchmark": ("pyarrow",),
+    "measured": ("c3d", "optuna", "matplotlib"),
     "optimisers": ("botorch", "ConfigSpace", "linear_operator", "optuna_integration", "ribs", "smac"),
 }
 """Extra in pyproject.toml -> modules that it installs."""

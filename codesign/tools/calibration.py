@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.codesign.tools.config import CalibrationConfig
+from softgym_envs.codesign.tools.fit_page import calibration_page, write_page
 from softgym_envs.codesign.tools.measurements import Measurements, read_measurements
 from softgym_envs.codesign.tools.misfit import FEMMisfit, LearnedMisfit, Misfit
 from softgym_envs.codesign.tools.parameters import Parameters
@@ -32,7 +33,8 @@ def calibrate(
 
     Args:
         config: what to fit.
-        folder: where ``result.json``, the resolved configuration and a picture go; None to write nothing.
+        folder: where ``result.json``, ``report.html``, the resolved configuration and a picture go; None to write
+            nothing.
         data: measurements, instead of those of the configuration's file.
 
     Raises:
@@ -48,10 +50,29 @@ def calibrate(
     with RunFolder(folder, CalibrationConfig, "a calibration").reserve(config) as place:
         result = _calibrate(config, data)
         write_json(place / "result.json", {**provenance(), **result.to_json()})
-        units = {name: variable.unit for name, variable in config.box().free.variables.items()}
-        units |= {name: nuisance.unit for name, nuisance in config.nuisances.items()}
-        draw_calibration(place / "calibration.png", units, result)
+        draw_calibration(place / "calibration.png", fitted_units(config), result)
+        titles = ("fitted states", "held-out trials")
+        parts = [
+            (title, part, predicted(config, result, part))
+            for title, part in zip(titles, data.split(config.held_out), strict=True)
+        ]
+        write_page(place / "report.html", calibration_page(config.name, result, fitted_units(config), parts))
     return result
+
+
+def fitted_units(config: CalibrationConfig) -> dict[str, str]:
+    """Return the SI unit of each fitted parameter by name."""
+    units = {name: variable.unit for name, variable in config.box().free.variables.items()}
+    return units | {name: nuisance.unit for name, nuisance in config.nuisances.items()}
+
+
+def predicted(config: CalibrationConfig, result: CalibrationResult, data: Measurements) -> np.ndarray:
+    """Return the readings (N, n_a + n_e) that a result predicts for the commands of some states."""
+    if not len(data):
+        return np.zeros((0, data.effort.shape[1] + data.effector.shape[1]))
+    backend = "fem" if result.refined is not None else config.backend
+    misfit = make_misfit(config, data, backend, fits=False)
+    return misfit.readings(misfit.parameters.point({**result.design, **result.nuisances}))
 
 
 def _calibrate(config: CalibrationConfig, data: Measurements) -> CalibrationResult:
@@ -94,6 +115,11 @@ def _calibrate(config: CalibrationConfig, data: Measurements) -> CalibrationResu
         plant=parameters.instrument(values, data.driven).plant([a.name for a in misfit.robot.actuators]),
         notes=theory.notes,
     )
+
+
+def _errors(config: CalibrationConfig, data: Measurements, backend: str, point: np.ndarray) -> dict[str, float]:
+    """Return the errors of states that were not fitted, as `Misfit.errors`."""
+    return make_misfit(config, data, backend, fits=False).errors(point) if len(data) else {}
 
 
 def make_misfit(config: CalibrationConfig, data: Measurements, backend: str, *, fits: bool = True) -> Misfit:

@@ -28,8 +28,8 @@ class Misfit(ABC):
     """Residuals of a body against measurements, each relative to the size of what was measured.
 
     Effector coordinates are divided by the root mean square of their distances from their mean, efforts by their own
-    root mean square. There are ``count`` residuals, which were computed ``evaluations`` times so far. A misfit that does
-    not fit, but predicts, takes any number of states.
+    root mean square. There are ``count`` residuals, which were computed ``evaluations`` times so far. One that
+    does not fit, but predicts, takes any number of states.
 
     Raises:
         ConfigError: for an offset of a column that was not measured.

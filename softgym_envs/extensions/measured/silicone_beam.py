@@ -104,7 +104,8 @@ def box_of_tetrahedra(cells: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarr
     counts = np.array(cells) + 1
     grid = np.stack(np.meshgrid(*(np.linspace(0.0, 1.0, c) for c in counts), indexing="ij"), axis=-1).reshape(-1, 3)
     steps = np.array([counts[1] * counts[2], counts[2], 1])
-    first = (np.stack(np.meshgrid(*(np.arange(c) for c in cells), indexing="ij"), axis=-1).reshape(-1, 3) @ steps)[:, None]
+    corners = np.stack(np.meshgrid(*(np.arange(c) for c in cells), indexing="ij"), axis=-1).reshape(-1, 3)
+    first = (corners @ steps)[:, None]
     parts = []
     for order in permutations(range(3)):
         walk = np.concatenate([[0], np.cumsum(steps[list(order)])])

@@ -56,15 +56,13 @@ class TendonRod(Robot):
         self.effector_rest = np.array([0.0, 0.0, self.size])
         self.effort_scale = np.full(9, 1.0)
         self.actuators = tuple(
-            Actuator(f"tendon_{segment}{place}", -PULL, PULL, 0.001)
-            for segment in range(1, 4)
-            for place in range(1, 4)
+            Actuator(f"tendon_{segment}{place}", -PULL, PULL, 0.001) for segment in range(1, 4) for place in range(1, 4)
         )
 
     def assemble(self, design: Mapping[str, float]) -> MechanicalModel:
         """Stand the rod up, thread each tendon through the discs up to the end of its segment."""
         starts = np.cumsum([0.0, *LENGTHS])
-        discs = [start + length * np.arange(1, n + 1) / n for start, length, n in zip(starts, LENGTHS, DISCS)]
+        discs = [s + length * np.arange(1, n + 1) / n for s, length, n in zip(starts[:-1], LENGTHS, DISCS, strict=True)]
         frames = np.concatenate([[0.0], *discs])
         builder = ModelBuilder(gravity=self.gravity)
         builder.add_rod(

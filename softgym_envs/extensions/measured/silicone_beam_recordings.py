@@ -1,0 +1,130 @@
+"""The silicone beam against its recordings: every load, element and mesh with the authors' material."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from softgym_envs.codesign.report.plots import OTHER, WINNER
+from softgym_envs.codesign.tools.fit_page import Page, Picture, Table, drawn
+from softgym_envs.extensions.measured.comparison import SOURCES, Comparison, Line, files_in, numbers
+from softgym_envs.extensions.measured.recordings import read_c3d, rigid_motion
+from softgym_envs.extensions.measured.silicone_beam import MESHES, SiliconeBeam
+from softgym_envs.mechanics.solvers.statics import Statics
+
+LOADS = {"gravity": 0.0, "load52": 0.51012, "load101": 1.00062}
+"""Weight at the tip [N], by a word in the name of the file."""
+PLACES = np.array(
+    [
+        [0.0, 0.015, 0.036],
+        [0.0, -0.006, 0.024],
+        [0.0, 0.036, 0.006],
+        [-0.094, -0.010, -0.001],
+        [-0.094, 0.040, 0.0275],
+        [-0.094, 0.040, 0.0],
+    ]
+)
+"""The markers on the straight beam [m] as in the authors' code: three at the tip and three at the base."""
+ELEMENTS = ("quadratic", "averaged", "linear")
+
+
+def measured_motion(path: Path) -> tuple[np.ndarray, float]:
+    """Return how far the tip's markers move from the held, straight beam to rest [m] (3, 3), and the misfit [m] there.
+
+    The markers of the held beam are laid on their places by a rigid motion; the misfit is its root mean square.
+    """
+    recording = read_c3d(path)
+    held = recording.still()
+    turn, shift = rigid_motion(held, PLACES)
+    misfit = float(np.sqrt(((held @ turn.T + shift - PLACES) ** 2).sum(axis=1).mean()))
+    return ((recording.end() - held) @ turn.T)[:3], misfit
+
+
+def compare(folder: Path) -> Comparison:
+    """Compare all recordings in a folder; see `Source.compare`."""
+    source = SOURCES["silicone_beam"]
+    files = {word: files_in(folder, f"*{word}*.c3d", source) for word in LOADS}
+    measured = {word: [measured_motion(path) for path in paths] for word, paths in files.items()}
+    rows, best, seconds = [], {}, {}
+    for element in ELEMENTS:
+        for mesh in MESHES:
+            robot = SiliconeBeam(element=element, mesh=mesh)
+            began = time.process_time()
+            for word, load in LOADS.items():
+                model = robot.build({"tip_load": load})
+                rest = np.concatenate([c.value(model.nodes) for c in model.constraints["e"]])
+                state = Statics(model).solve([0.0], "effort")
+                best[element, mesh, word] = (state.condensed.delta.e - rest).reshape(3, 3)
+            seconds[element, mesh] = time.process_time() - began
+            moved = [best[element, mesh, word] for word in LOADS]
+            errors = [
+                np.mean([np.abs(m[:, 2] - motion[:, 2]) for motion, _ in measured[word]])
+                for m, word in zip(moved, LOADS, strict=True)
+            ]
+            whole = [
+                np.mean([np.linalg.norm(m - motion, axis=1) for motion, _ in measured[word]])
+                for m, word in zip(moved, LOADS, strict=True)
+            ]
+            size = f"{len(model.nodes)}"
+            texts = [f"{1e3 * value:.2f}" for value in (*errors, *whole)]
+            rows.append([element, mesh, size, *texts, f"{seconds[element, mesh]:.1f}"])
+    shown = ("quadratic", "fine")
+    vertical = {
+        word: [np.abs(best[*shown, word][:, 2] - motion[:, 2]) for motion, _ in measured[word]] for word in LOADS
+    }
+    largest = 1e3 * max(np.max(v) for v in vertical.values())
+    lines = [Line("vertical error, largest of all markers and loads", f"{largest:.2f} mm", source.others)]
+    for word, load in LOADS.items():
+        drop = -1e3 * np.mean([motion[:, 2] for motion, _ in measured[word]])
+        errors = f"{numbers(1e3 * np.mean(vertical[word], axis=0))} mm of {drop:.1f} mm"
+        lines.append(
+            Line(f"  {load:.2f} N at the tip, three markers, mean of {len(files[word])} recordings", errors, "")
+        )
+
+    def draw(axes: list[Any]) -> None:
+        for axis, (word, load) in zip(axes, LOADS.items(), strict=True):
+            for color, symbol, name, motions in (
+                (OTHER, "o", "measured", [motion for motion, _ in measured[word]]),
+                (WINNER, "x", "computed", [best[*shown, word]]),
+            ):
+                for k, motion in enumerate(motions):
+                    at = 1e3 * (PLACES[:3] + motion)
+                    axis.plot(at[:, 0], at[:, 2], symbol, color=color, label=name if k == 0 else None, ms=9)
+            rest = 1e3 * PLACES[:3]
+            axis.plot(rest[:, 0], rest[:, 2], ".", color="0.6", label="held straight")
+            axis.set_title(f"{load:.2f} N")
+            axis.set_xlabel("x [mm]")
+            axis.set_aspect("equal", adjustable="datalim")
+        axes[0].set_ylabel("z [mm]")
+        axes[0].legend()
+
+    misfit = 1e3 * max(value for group in measured.values() for _, value in group)
+    columns = ["element", "mesh", "nodes"]
+    columns += [f"vertical, {load:.2f} N [mm]" for load in LOADS.values()]
+    columns += [f"distance, {load:.2f} N [mm]" for load in LOADS.values()]
+    page = Page(
+        "Silicone beam: measured and computed",
+        [
+            f"Nothing is fitted: modulus 263,824 Pa and density 1070 kg/m3 are the authors', Poisson's ratio is 0.49. "
+            f"The largest vertical error is {largest:.2f} mm.",
+            f"Recordings: {source.origin}, {source.folder}. Others: {source.others}.",
+            f"Held straight, the markers lie within {misfit:.1f} mm (root mean square) of where the authors say.",
+        ],
+        [
+            Picture(
+                "Markers at the tip",
+                drawn(draw, 3, width=3.8),
+                "From the side, on the fine mesh of quadratic elements.",
+            ),
+            Table(
+                "Error by load, element and mesh (mean over markers and recordings)",
+                [*columns, "CPU [s]"],
+                rows,
+                "Linear elements lock: they are too stiff in bending.",
+            ),
+        ],
+    )
+    return Comparison(lines, [], page)
