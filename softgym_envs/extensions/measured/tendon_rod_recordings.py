@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from softgym_envs.codesign.report.plots import OTHER, WINNER
+from softgym_envs.codesign.report.plots import BASELINE, WINNER
 from softgym_envs.codesign.tools.calibration import calibrate, fitted_units, predicted
 from softgym_envs.codesign.tools.config import CalibrationConfig
 from softgym_envs.codesign.tools.fit_page import Page, Picture, Table, drawn, parameter_table, residual_picture
@@ -115,21 +115,12 @@ def compare(folder: Path) -> Comparison:
     plain = Measurements("displacement", centred_pulls(held), held.effort, held.effector, held.trial)
     textbook = type(result)(**{**vars(result), "design": {**result.design, "twist": 0.0}, "nuisances": {}})
     nominal = predicted(nominal_config, textbook, plain)[:, 9:] - held.effector
+    ours, there = f"{rmse(error['held out']):.1f} mm RMSE", f"{rmse(error['fitted']):.1f} mm RMSE"
     lines = [
-        Line(
-            f"held-out poses ({of}, {len(held)}), offset aligned",
-            f"{rmse(error['held out']):.1f} mm RMSE",
-            source.others,
-        ),
+        Line(f"held-out poses ({of}, {len(held)}), offset aligned", ours, source.others),
         Line("  without alignment", f"{rmse(error['held out'], aligned=False):.1f} mm RMSE", ""),
-        Line(
-            f"  fitted poses ({len(fitted)}), offset aligned",
-            f"{rmse(error['fitted']):.1f} mm RMSE",
-            f"{count} numbers",
-        ),
-        Line(
-            "  held out with textbook values, mean pull of each segment taken away", f"{rmse(nominal):.1f} mm RMSE", ""
-        ),
+        Line(f"  fitted poses ({len(fitted)}), offset aligned", there, f"{count} numbers"),
+        Line("  held out, textbook values, less the mean pull of each segment", f"{rmse(nominal):.1f} mm RMSE", ""),
         Line("identification", f"{seconds:.0f} CPU s", ""),
         Line("speed", f"{pace:.1f} CPU s for 1,000 poses", ""),
     ]
@@ -156,15 +147,15 @@ def compare(folder: Path) -> Comparison:
             rows.append([f"  held out, {group}", f"{mask.sum()}", *texts, f"{np.percentile(away, 95):.1f}"])
     rest = (
         f"What is left: {int(still.sum())} poses with all pulls within {1e3 * STILL:g} mm of their mean lie "
-        f"{spread:.1f} mm (RMS) about their own mean. No function of the present pulls explains this scatter. Poses with "
-        "one tendon pulled against slack ones, outside of the fit, are worst."
+        f"{spread:.1f} mm (RMS) about their own mean. No function of the present pulls explains this scatter. "
+        "Poses with one tendon pulled against slack ones, outside of the fit, are worst."
     )
 
     def draw(axes: list[Any]) -> None:
         computed = found["held out"][:, 9:]
         for axis, across in zip(axes, (0, 1), strict=True):
             for color, symbol, label, values in (
-                (OTHER, "o", "measured", held.effector),
+                (BASELINE, "o", "measured", held.effector),
                 (WINNER, "x", "computed", computed),
             ):
                 axis.plot(1e3 * values[:, across], 1e3 * values[:, 2], symbol, color=color, label=label, ms=4)
@@ -181,8 +172,8 @@ def compare(folder: Path) -> Comparison:
             f"{ours} on {len(held)} held-out poses after fitting {count} physical numbers to {len(fitted)} others "
             f"({there} there), offset aligned.",
             f"Recordings: {source.origin}, {source.folder}. Others: {source.others}.",
-            "The tendons' stretch is known only in proportion to the rod's flexibility: recordings of positions without "
-            "a force cannot tell them apart. The modulus is the authors' 10 GPa.",
+            "The tendons' stretch is known only in proportion to the rod's flexibility: recordings of positions "
+            "without a force cannot tell them apart. The modulus is the authors' 10 GPa.",
             rest,
             *result.notes,
         ],
