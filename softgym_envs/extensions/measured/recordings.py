@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import struct
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -46,9 +47,7 @@ class Recording:
         before = speed[: released[0]] if len(released) else speed
         still = np.flatnonzero(before < slowest)
         if not len(still):
-            raise DataError(
-                f"the recording has no still frame, slower than {slowest:g} m/s, before the body is released"
-            )
+            raise DataError(f"no frame before the body is released is still, slower than {slowest:g} m/s")
         return np.nanmean(self.markers[still[-frames:]], axis=0)
 
     def end(self, frames: int = 20) -> np.ndarray:
@@ -74,7 +73,7 @@ def read_c3d(path: str | Path) -> Recording:
             labels = tuple(label.strip() for label in reader.point_labels)
             unit = reader.get("POINT:UNITS")
             rate = float(reader.point_rate)
-    except (OSError, ValueError, AssertionError, KeyError, IndexError, EOFError) as error:
+    except (OSError, ValueError, AssertionError, KeyError, IndexError, EOFError, struct.error) as error:
         raise DataError(f"recording '{path}' cannot be read as C3D: {error}") from None
     scales = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
     name = unit.string_value.strip() if unit is not None else "mm"
@@ -97,12 +96,9 @@ def read_marker_table(path: str | Path) -> Recording:
     except (OSError, ValueError, UnicodeDecodeError) as error:
         raise DataError(f"recording '{path}' cannot be read as a table of markers: {error}") from None
     if rows.ndim != 2 or len(rows) < 2 or rows.shape[1] < 5 or (rows.shape[1] - 2) % 3:
-        raise DataError(
-            f"recording '{path}' must have rows of: frame, time, x, y and z of each marker; got {rows.shape}"
-        )
-    return Recording(
-        rows[:, 2:].reshape(len(rows), -1, 3), (), float((len(rows) - 1) / max(rows[-1, 1] - rows[0, 1], 1e-12))
-    )
+        raise DataError(f"recording '{path}' must have rows of frame, time, and x, y, z of each marker: {rows.shape}")
+    duration = max(rows[-1, 1] - rows[0, 1], 1e-12)
+    return Recording(rows[:, 2:].reshape(len(rows), -1, 3), (), float((len(rows) - 1) / duration))
 
 
 def rigid_motion(points: np.ndarray, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -112,8 +112,8 @@ def compare(folder: Path) -> Comparison:
     page = Page(
         "Silicone beam: measured and computed",
         [
-            "Nothing is fitted here: Poisson's ratio 0.499 and density 1070 kg/m3 are those of the authors' code, and the "
-            "modulus of 263,824 Pa is what they fitted themselves. "
+            "Nothing is fitted here: Poisson's ratio 0.499 and density 1070 kg/m3 are those of the authors' code, and "
+            "the modulus of 263,824 Pa is what they fitted themselves. "
             f"The largest vertical error is {largest:.2f} mm against the mean recording of a load, and {single:.2f} mm "
             f"against a single one; recordings of one load differ by up to {apart:.2f} mm.",
             f"Recordings: {source.origin}, {source.folder}. Others: {source.others}.",

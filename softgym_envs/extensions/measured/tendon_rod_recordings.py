@@ -100,7 +100,9 @@ def compare(folder: Path) -> Comparison:
     result = calibrate(config, data=train)
     seconds = time.process_time() - began
     fitted = train.split(names)[0]
-    parts = {"fitted": fitted, "held out": held, "one tendon pulled, others slack": everything.part(single)}
+    parts = {"fitted": fitted, "held out": held}
+    if single.any():
+        parts["one tendon pulled, others slack"] = everything.part(single)
     found, pace = {}, 0.0
     for kind, part in parts.items():
         began = time.process_time()
