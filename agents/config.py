@@ -67,7 +67,7 @@ class EnvironmentConfig(Config):
     robot_options: Annotated[dict[str, Any], BesideConfig()] = {}
     task_options: Annotated[dict[str, Any], BesideConfig()] = {}
     backend_options: Annotated[dict[str, Any], BesideConfig()] = {}
-    plant: dict[str, float | tuple[float, float]] | None = None
+    plant: dict[str, float | tuple[float, float] | dict[str, float | tuple[float, float]]] | None = None
     residual_scale: float = Field(default=0.0, ge=0, le=2)
 
     @model_validator(mode="before")
