@@ -37,6 +37,7 @@ LAYERS = [
         "softgym_envs.extensions.grasping",
         "softgym_envs.extensions.leaderboard",
         "softgym_envs.extensions.learners",
+        "softgym_envs.extensions.measured",
         "softgym_envs.extensions.networks",
         "softgym_envs.extensions.sensing",
     },

@@ -33,30 +33,31 @@ class Instrument:
     def driven(self, commands: np.ndarray, trial: Sequence[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return what the drives did, with derivatives.
 
-        In each trial, they begin in the middle of their play.
+        Each trial begins at rest, where they are at zero.
 
         Args:
             commands: recorded, shape (N, n_a).
             trial: of each row, or empty for one trial; the rows of a trial follow each other in time.
 
         Returns:
-            What they did, shape (N, n_a). From which row a drive that moved last took its command, shape (N, n_a), and
-            on which side of its play it was: the derivative with respect to its width, shape (N, n_a).
+            What they did, shape (N, n_a). From which row each took its command when it moved last, -1 for one that
+            has not moved in its trial, shape (N, n_a); and on which side of its play it was then: the derivative with
+            respect to its width, shape (N, n_a).
         """
         wanted = self.gain * commands - self.offset
         if not self.backlash.any():
             rows = np.arange(len(wanted))[:, None]
             return wanted, np.broadcast_to(rows, wanted.shape), np.zeros(wanted.shape)
         done, source, side = wanted.copy(), np.zeros(wanted.shape, dtype=np.int64), np.zeros(wanted.shape)
+        still = np.zeros(wanted.shape[1]), np.full(wanted.shape[1], -1), np.zeros(wanted.shape[1])
         for i in range(len(wanted)):
-            if i == 0 or (len(trial) and trial[i] != trial[i - 1]):
-                source[i] = i
-                continue
+            begins = i == 0 or (len(trial) and trial[i] != trial[i - 1])
+            at, since, edge = still if begins else (done[i - 1], source[i - 1], side[i - 1])
             low, high = wanted[i] - 0.5 * self.backlash, wanted[i] + 0.5 * self.backlash
-            done[i] = np.clip(done[i - 1], low, high)
-            moved = (done[i - 1] < low) | (done[i - 1] > high)
-            source[i] = np.where(moved, i, source[i - 1])
-            side[i] = np.where(moved, np.where(done[i - 1] < low, -0.5, 0.5), side[i - 1])
+            done[i] = np.clip(at, low, high)
+            moved = (at < low) | (at > high)
+            source[i] = np.where(moved, i, since)
+            side[i] = np.where(moved, np.where(at < low, -0.5, 0.5), edge)
         return done, source, side
 
     def rotation(self) -> tuple[np.ndarray, np.ndarray]:

@@ -298,6 +298,8 @@ class FEMMisfit(Misfit):
         rotation, turned = instrument.rotation()
         bodies = solved.effector.reshape(count, -1, 3)
 
+        driven = solved.source >= 0
+
         def through(change: np.ndarray) -> np.ndarray:
             """Return the change of the readings for a change of what the drives do (N, n_a)."""
             moved = np.einsum("nij,nj->ni", solved.slopes, change)
@@ -319,12 +321,14 @@ class FEMMisfit(Misfit):
             elif touched or isinstance(nuisance, ContactConfig | FrictionConfig):
                 continue
             elif isinstance(nuisance, OffsetConfig):
-                change[:, imposed.index(nuisance.column)] = -1.0
+                at = [imposed.index(nuisance.column)]
+                change[:, at] = -driven[:, at].astype(float)
                 found[name] = through(change)
             else:
                 at = [imposed.index(column) for column in nuisance.columns]
                 if nuisance.kind == "gain":
-                    change[:, at] = np.take_along_axis(self.data.command, solved.source, axis=0)[:, at]
+                    recorded = np.take_along_axis(self.data.command, np.maximum(solved.source, 0), axis=0)
+                    change[:, at] = (recorded * driven)[:, at]
                 elif nuisance.kind == "backlash":
                     change[:, at] = solved.side[:, at]
                 else:
