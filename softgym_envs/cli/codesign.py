@@ -141,5 +141,9 @@ def calibrate(config: Path, folder: Path | None, overrides: tuple[str, ...]) -> 
         if name in result.at_bound:
             text += "; at its bound: the best fit may lie outside the bounds"
         click.echo(text)
+    for note in result.notes:
+        click.echo(note)
     errors = ", ".join(f"{name} {value:.3g}" for name, value in result.errors.items())
+    if result.held_out_errors:
+        errors += "; held out: " + ", ".join(f"{name} {value:.3g}" for name, value in result.held_out_errors.items())
     click.echo(f"root mean square errors: {errors} (SI units); {result.seconds:.1f} s; wrote {folder}")

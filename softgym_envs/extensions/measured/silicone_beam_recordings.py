@@ -85,8 +85,8 @@ def compare(folder: Path) -> Comparison:
         ),
     ]
     for word, load in LOADS.items():
-        errors = f"{numbers(vertical[word])} mm of {-drops[word].mean():.1f} mm"
-        lines.append(Line(f"  {load:.2f} N at the tip, each marker, mean of {len(files[word])} recordings", errors, ""))
+        away = f"{numbers(vertical[word])} mm of {-drops[word].mean():.1f} mm"
+        lines.append(Line(f"  {load:.2f} N at the tip, each marker, mean of {len(files[word])} recordings", away, ""))
 
     def draw(axes: list[Any]) -> None:
         for axis, (word, load) in zip(axes, LOADS.items(), strict=True):
