@@ -83,7 +83,7 @@ class FrictionGripper(FingerRobot):
         )
         return frame
 
-    def hold(self, model: MechanicalModel, design: Mapping[str, float], frame: int | None) -> None:
+    def attach_object(self, model: MechanicalModel, design: Mapping[str, float], frame: int | None) -> None:
         """Give the object its surface; the effector is its centre."""
         assert frame is not None
         self._frame = frame

@@ -124,7 +124,7 @@ class FingerRobot(Robot):
         """Return the effector at rest [m], shape (3,)."""
 
     @abstractmethod
-    def hold(self, model: MechanicalModel, design: Mapping[str, float], frame: int | None) -> None:
+    def attach_object(self, model: MechanicalModel, design: Mapping[str, float], frame: int | None) -> None:
         """Tie the fingers to each other, or to the object whose frame is given, and add the effector."""
 
     def object_frame(self, design: Mapping[str, float]) -> np.ndarray | None:
@@ -168,7 +168,7 @@ class FingerRobot(Robot):
                     radius=self.guide_radius,
                 )
         self._mesh = mesh
-        self.hold(model, design, frame)
+        self.attach_object(model, design, frame)
         return model
 
     def material_point(
@@ -241,7 +241,7 @@ class PressFinger(FingerRobot):
         path[:, 1] = np.linspace(0.020, 0.044, count)
         return path
 
-    def hold(self, model: MechanicalModel, design: Mapping[str, float], frame: int | None) -> None:
+    def attach_object(self, model: MechanicalModel, design: Mapping[str, float], frame: int | None) -> None:
         """Tie the contact points to the button and load it; the effector is its centre."""
         assert frame is not None
         self.tie_contacts(model, frame)
@@ -286,7 +286,7 @@ class TwoFingerGripper(FingerRobot):
         path[:, 0] = np.interp(np.linspace(0.0, 4.0, count), [0.0, 1.0, 3.0, 4.0], [0.0, 0.030, -0.030, 0.0])
         return path
 
-    def hold(self, model: MechanicalModel, design: Mapping[str, float], frame: int | None) -> None:
+    def attach_object(self, model: MechanicalModel, design: Mapping[str, float], frame: int | None) -> None:
         """Tie the tips at the bar's length; the effector lies halfway between them."""
         tip, reference = self.finger.tip(design), self.finger.tip(self.finger.reference_design)
         first, second = (self.material_point(model, k, tip, reference, radius=TIP_RADIUS) for k in (0, 1))
@@ -323,7 +323,7 @@ class ThreeFingerGripper(FingerRobot):
 
     object_frame = object_rest
 
-    def hold(self, model: MechanicalModel, design: Mapping[str, float], frame: int | None) -> None:
+    def attach_object(self, model: MechanicalModel, design: Mapping[str, float], frame: int | None) -> None:
         """Tie nine contact points to the cube; the effector is its centre."""
         assert frame is not None
         self.tie_contacts(model, frame)

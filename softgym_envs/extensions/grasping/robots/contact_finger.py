@@ -96,7 +96,7 @@ class ContactFinger(FingerRobot):
         found[:, 2:] = np.clip(middle + spread, self.lower[2:], self.upper[2:])
         return found
 
-    def hold(self, model: MechanicalModel, design: Mapping[str, float], frame: int | None) -> None:
+    def attach_object(self, model: MechanicalModel, design: Mapping[str, float], frame: int | None) -> None:
         """Tie the contact points to the frame and drive it; the effector is the tip."""
         assert frame is not None
         self.tie_contacts(model, frame)
