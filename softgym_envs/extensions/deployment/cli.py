@@ -136,22 +136,31 @@ def deploy_policy(policy: str, files: tuple[Path, ...], name: str) -> None:
 @options.robot_option
 @options.design
 @click.option("--moulds", type=options.PATH, help="Write the parts of a finger's mould to this folder.")
+@click.option("--joints", default=9, show_default=True, help="Joints of the chain in an .xml file.")
 def export(
-    robot: str, files: tuple[Path, ...], options_: tuple[str, ...], design: tuple[str, ...], moulds: Path | None
+    robot: str,
+    files: tuple[Path, ...],
+    options_: tuple[str, ...],
+    design: tuple[str, ...],
+    moulds: Path | None,
+    joints: int,
 ) -> None:
-    """Write a body to STEP or STL files, or the moulds to cast it in.
+    """Write a body to STEP, STL or MuJoCo files, or the moulds to cast it in.
 
-    FILES end with .step or .stl; all lengths are in millimetres.
+    FILES end with .step or .stl, in millimetres, or with .xml: a chain of rigid links for MuJoCo, in metres.
     """
     from softgym_envs.extensions.deployment.cad import export_body
+    from softgym_envs.extensions.deployment.mjcf import export_mjcf
     from softgym_envs.extensions.deployment.moulds import export_moulds
 
     if not files and moulds is None:
-        raise ConfigError("nothing to write: pass a file ending with .step or .stl, or a folder with --moulds")
+        raise ConfigError("nothing to write: pass a file ending with .step, .stl or .xml, or a folder with --moulds")
     body = options.robot_of(robot, options_)
     chosen = options.design_of(design)
-    written = [export_body(body, file, chosen) for file in files]
-    if moulds is not None:
-        written += export_moulds(body, moulds, chosen)
-    for path in written:
+    for file in files:
+        if file.suffix == ".xml":
+            click.echo(f"wrote {export_mjcf(body, file, chosen, joints=joints)} (metres)")
+        else:
+            click.echo(f"wrote {export_body(body, file, chosen)} (millimetres)")
+    for path in export_moulds(body, moulds, chosen) if moulds is not None else ():
         click.echo(f"wrote {path} (millimetres)")
