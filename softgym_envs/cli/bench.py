@@ -18,7 +18,7 @@ from softgym_envs.errors import ConfigError
 def bench(output: Path, names: tuple[str, ...]) -> None:
     """Measure speed.
 
-    Runs the benchmarks NAMES, or all of them if no name is given, which takes half an hour. Needs a source checkout.
+    Runs the benchmarks NAMES, or all of them if no name is given. Needs a source checkout.
     """
     try:
         from benchmarks.run import run
