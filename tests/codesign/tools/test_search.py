@@ -290,7 +290,7 @@ def test_a_continued_run_keeps_its_first_provenance(stub, tmp_path, capsys):
         (continued,) = kept.pop("continued")
         change = f"begun with sources other; continued with sources {continued['sources']}"
         assert kept == begun
-        assert f"warning: {kind} in '{folder}' was {change}; what they compute may differ" in capsys.readouterr().err
+        assert f"warning: {kind} '{folder}' was {change}; what they compute may differ" in capsys.readouterr().err
         assert json.loads((folder / "result.json").read_text())["code_changes"] == [change]
 
 
