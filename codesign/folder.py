@@ -48,7 +48,7 @@ class StudyFolder(RunFolder[StudyConfig]):
         screen/000.json ...            score of each candidate of the screen
         shared_policy/                 policy that scores every body, for strategies that have one
         trials/0000/ ...               training of each trial, and its result.json once it is finished
-        finalists/*.json               one test each
+        finalists/*.json               one test each, those of many goals joined from finalists/parts/*.json
         account.json                   time spent, and the command
         locks/                         locks of the operating system, which end with their holder
         results.json  trials.csv  finalists.csv  report.html
@@ -126,7 +126,7 @@ class StudyFolder(RunFolder[StudyConfig]):
 
         A training that has not ended depends on none of them: with another number of steps it begins again.
         """
-        if any(self.path.glob("finalists/*.json")):
+        if any(self.path.glob("finalists/*.json")) or any(self.path.glob("finalists/parts/*.json")):
             return TEST_SETTINGS
         return TEST_SETTINGS[:1] if any(self.path.glob("finalists/*/policy.safetensors")) else ()
 

@@ -304,10 +304,11 @@ class TestGroup:
 
 @dataclass(frozen=True)
 class Job:
-    """One JSON file of results and the function that makes its content."""
+    """One JSON file of results, the function that makes its content, and the files that it is made from."""
 
     path: Path
     make: Callable[[], Record]
+    needs: tuple[Path, ...] = ()
 
 
 @dataclass(frozen=True)

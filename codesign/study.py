@@ -249,6 +249,7 @@ def _run_finalists(study: StudyFolder, workers: int, output: Progress) -> None:
         jobs = finalist_jobs(snapshot)
         if all(job.path.exists() for job in jobs):
             return
+        tests = [job.path for job in jobs if job.path.parent.name == "finalists"]
         if missing := missing_jobs(study, jobs):
             if refinement is not None and snapshot.refinements:
                 text = f"baseline and winner on {counted(refinement.goals, 'unseen goal')}, fem with a finer mesh"
@@ -257,9 +258,9 @@ def _run_finalists(study: StudyFolder, workers: int, output: Progress) -> None:
                 text = (
                     f"{counted(len(snapshot.finalists), 'body')} on {goals}, {' and '.join(study.config.test_backends)}"
                 )
-            done = len(jobs) - len(missing)
-            before = f", {done} of {counted(len(jobs), 'test')} finished before" if done and first else ""
-            output.begin("test", text + before, len(jobs), done)
+            done = sum(path.exists() for path in tests)
+            before = f", {done} of {counted(len(tests), 'test')} finished before" if done and first else ""
+            output.begin("test", text + before, len(tests), done)
             _run_jobs(study, output, "finalists", missing, workers, output.tests)
         first = False
 

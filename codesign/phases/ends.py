@@ -7,7 +7,7 @@ are several. So an episode runs on the surrogate, and finite elements go on from
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -57,6 +57,7 @@ def run_ends(
     *,
     start: EnvironmentConfig,
     last_steps: int,
+    names: Sequence[str] | None = None,
 ) -> FinalStates:
     """Return where an agent ends on finite elements: the inverse QP settled, a policy after its last steps.
 
@@ -67,16 +68,18 @@ def run_ends(
         design: complete body [SI].
         start: the same environment on the surrogate.
         last_steps: control steps of a policy on finite elements.
+        names: of the goals, for messages; default their numbers.
 
     Raises:
         InfeasibleDesign: if the body cannot exist.
-        ConvergenceError: with the number of the goal, if a command has no equilibrium.
+        ConvergenceError: with the name of the goal, if a command has no equilibrium.
     """
     began, cpu = time.perf_counter(), time.process_time()
     points = np.asarray(goals, dtype=float)[:, -1]
     commands = final_commands(agent, start, points, design)
     order = nearest_next(commands, environment.make_robot())
-    found = _PendingGoals(environment, points, commands, order, dict(design))
+    names = names or [f"goal {k + 1} of {len(points)}" for k in range(len(points))]
+    found = _PendingGoals(environment, points, commands, order, dict(design), names)
     ended, unknowns = _settle(found) if agent == "qp" else _follow(found, agent, last_steps)
     columns = {name: np.array([getattr(ended[k], name) for k in range(len(points))]) for name in _COLUMNS}
     motions = [each.motion for each in ended.values() if each.motion is not None]
@@ -146,9 +149,10 @@ class _PendingGoals:
     commands: np.ndarray
     order: list[int]
     design: dict[str, float]
+    names: Sequence[str]
 
     def lost(self, goal: int, error: ConvergenceError) -> ConvergenceError:
-        return ConvergenceError(f"goal {goal + 1} of {len(self.points)}: {error}", fraction=error.fraction)
+        return ConvergenceError(f"{self.names[goal]}: {error}", fraction=error.fraction)
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,16 @@ If the study names a finer mesh, baseline and winner are then tested on it too.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from softgym_envs.agents.config import EnvironmentConfig, TrainConfig
+from softgym_envs.agents.evaluation import Evaluation
 from softgym_envs.agents.policy import Policy
 from softgym_envs.agents.training import train
 from softgym_envs.codesign.config import StudyConfig
@@ -24,14 +28,30 @@ from softgym_envs.errors import ConfigError, ConvergenceError, InfeasibleDesign
 from softgym_envs.runs import RunFolder
 from softgym_envs.storage import read_json
 
+GOALS_PER_JOB = 8
+"""Most goals of one job, where tests of ends are slow; the cores share the jobs of one test."""
+
 
 def finalist_jobs(snapshot: StudySnapshot) -> list[Job]:
-    """Return one job per body, controller, backend and seed, the slow ones first.
+    """Return the jobs of all tests, one per body, controller, backend and seed, the slow ones first.
 
-    The last jobs are those on the finer mesh; they are there once the others are done.
+    A slow test of many goals is joined from jobs of its goals. Those on the finer mesh are there once the others are
+    done.
     """
-    folder, plans = snapshot.folder, [*snapshot.planned_tests, *snapshot.refinements]
-    return [Job(folder.path / plan.file, partial(_test, folder, plan)) for plan in plans]
+    folder, parts, tests = snapshot.folder, [], []
+    for plan in [*snapshot.planned_tests, *snapshot.refinements]:
+        path = folder.path / plan.file
+        goals = range(len(folder.goals[plan.goals])) if plan.numbers is None else plan.numbers
+        slow = snapshot.config.finalists.test == "ends" and plan.backend != "surrogate"
+        if path.exists() or not slow or len(goals) <= GOALS_PER_JOB:
+            tests.append(Job(path, partial(_test, folder, plan)))
+            continue
+        chunks = np.array_split(np.array(goals), -(-len(goals) // GOALS_PER_JOB))
+        files = [path.parent / "parts" / f"{path.stem}-{chunk[0]:03d}.json" for chunk in chunks]
+        for file, chunk in zip(files, chunks, strict=True):
+            parts.append(Job(file, partial(_test, folder, replace(plan, numbers=tuple(chunk.tolist())))))
+        tests.append(Job(path, partial(_join, folder, plan, files), tuple(files)))
+    return parts + tests
 
 
 def fetch_policies(snapshot: StudySnapshot) -> None:
@@ -120,7 +140,9 @@ def _test(folder: StudyFolder, plan: PlannedTest) -> FinalistTest:
         if config.finalists.test == "ends" and plan.backend != "surrogate":
             start = finalist_environment(config, "surrogate", finalist.options)
             steps = config.finalists.last_steps
-            ends = run_ends(controller, environment, goals, finalist.design, start=start, last_steps=steps)
+            total = len(folder.goals[plan.goals])
+            names = [f"goal {number + 1} of {total}" for number in (numbers or range(total))]
+            ends = run_ends(controller, environment, goals, finalist.design, start=start, last_steps=steps, names=names)
             test.unknowns, test.last_motion = ends.unknowns, ends.last_motion
             found = measure(config, environment, ends.evaluation, finalist.design)
         else:
@@ -132,6 +154,24 @@ def _test(folder: StudyFolder, plan: PlannedTest) -> FinalistTest:
         return test
     test.evaluation, test.values = found.evaluation, found.values
     test.goal_values = found.measurements[config.objective].per_goal
+    return test
+
+
+def _join(folder: StudyFolder, plan: PlannedTest, files: Sequence[Path]) -> FinalistTest:
+    """Return a test from those of parts of its goals."""
+    config, finalist = folder.config, plan.finalist
+    parts = [FinalistTest.read(file) for file in files]
+    numbers = None if plan.numbers is None else list(plan.numbers)
+    test = FinalistTest(finalist.trial, plan.agent, plan.backend, plan.goals, plan.seed, numbers=numbers)
+    test.unknowns = parts[0].unknowns
+    test.last_motion = max((part.last_motion for part in parts if part.last_motion is not None), default=None)
+    test.error = next((part.error for part in parts if part.error is not None), None)
+    if test.error is None:
+        evaluation = Evaluation.merge([part.evaluation for part in parts if part.evaluation is not None])
+        environment = finalist_environment(config, plan.backend, finalist.options)
+        found = measure(config, environment, evaluation, finalist.design)
+        test.evaluation, test.values = found.evaluation, found.values
+        test.goal_values = found.measurements[config.objective].per_goal
     return test
 
 

@@ -38,6 +38,9 @@ def run_pending(folder: StudyFolder, jobs: Iterable[Job]) -> None:
             name = job.path.relative_to(folder.path).as_posix()
             if job.path.exists():
                 continue
+            if not all(path.exists() for path in job.needs):
+                busy.append(job)
+                continue
             with storage.attempt(name) as mine:
                 if (content := storage.fetch(name)) is not None:  # done, perhaps on another machine
                     if not job.path.exists():

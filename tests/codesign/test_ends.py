@@ -14,6 +14,7 @@ from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.folder import StudyFolder
 from softgym_envs.codesign.goals import Stratum, missed_first
 from softgym_envs.codesign.phases import ends
+from softgym_envs.codesign.phases.finalists import finalist_environment
 from softgym_envs.codesign.records import FinalistTest, TrialResult
 from softgym_envs.codesign.report.collect import collect
 from softgym_envs.codesign.report.episodes import MOMENTS, moments
@@ -331,7 +332,7 @@ def killed_and_continued(tmp_path_factory, tiny, start_study):
     folder = tmp_path_factory.mktemp("ends") / "study"
     data = tiny(
         trials=3,
-        goals={"count": 4, "unseen_count": 5, "training_count": 1},
+        goals={"count": 4, "unseen_count": 9, "training_count": 1},  # more than one job has
         finalists={"count": 1, "test": "ends", "choose": "fem", "refinement": HALF_MISSED},
     )
     process = start_study(folder, data)
@@ -356,6 +357,20 @@ def test_a_killed_test_continues(killed_and_continued):
     assert kinds == sorted(2 * each if winner.role != "baseline" else 2 * [k for k in each if "refined" not in k])
 
 
+def test_goals_of_one_test_are_shared_by_the_workers(killed_and_continued):
+    """A test is what its parts found, goal by goal, and what one call finds for all goals."""
+    folder, *_ = killed_and_continued
+    parts = [FinalistTest.read(path) for path in sorted(folder.path.glob("finalists/parts/trial0000-*.json"))]
+    assert [part.numbers for part in parts] == [[0, 1, 2, 3, 4], [5, 6, 7, 8]]
+    joined = FinalistTest.read(folder.path / "finalists" / "trial0000-qp-fem-unseen.json")
+    distances = np.concatenate([part.evaluation.distances for part in parts])
+    assert joined.numbers is None and joined.evaluation.distances.tolist() == distances.tolist()
+    environment, start = (finalist_environment(folder.config, kind, {}) for kind in ("fem", "surrogate"))
+    design = folder.config.baseline
+    whole = ends.run_ends("qp", environment, folder.goals["unseen"], design, start=start, last_steps=1)
+    assert np.allclose(whole.evaluation.distances, distances, atol=1e-6)
+
+
 def test_its_report_shows_every_mesh(killed_and_continued):
     folder, *_ = killed_and_continued
     text = write_report(folder.path).read_text()
@@ -368,9 +383,9 @@ def test_its_report_shows_every_mesh(killed_and_continued):
         for t in sorted(snapshot.tests, key=lambda t: t.unknowns or 0)
         if t.trial == 0 and t.goals == "unseen" and t.backend != "surrogate"
     )
-    assert coarse.unknowns < fine.unknowns and len(fine.mean) == 4 and len(coarse.mean) == 5
-    missed = [number for number in range(5) if not coarse.mean.successes[number]]
-    half = missed[: max(2, 4 - (5 - len(missed)))]
+    assert coarse.unknowns < fine.unknowns and len(fine.mean) == 4 and len(coarse.mean) == 9
+    missed = [number for number in range(9) if not coarse.mean.successes[number]]
+    half = missed[: max(2, 4 - (9 - len(missed)))]
     assert fine.numbers[: len(half)] == half and len(set(fine.numbers)) == 4
     # The meshes differ by more than a millimetre, but the same goal is the worst.
     assert fine.mean.distances.argmax() == coarse.mean.distances[fine.numbers].argmax() == 0
