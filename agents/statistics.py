@@ -45,7 +45,7 @@ def stratified_estimate(scores: np.ndarray, *, resamples: int = 2000) -> Estimat
     def statistic(*columns: np.ndarray, axis: int = -1) -> np.ndarray:
         return stats.trim_mean(np.concatenate(columns, axis=-1), 0.25, axis=-1)
 
-    return _interval(tuple(scores.T), statistic, resamples)
+    return bootstrap(tuple(scores.T), statistic, resamples)
 
 
 def crossed_estimate(scores: np.ndarray, *, resamples: int = 2000) -> Estimate:
@@ -75,7 +75,7 @@ def crossed_estimate(scores: np.ndarray, *, resamples: int = 2000) -> Estimate:
         table = scores[i[..., :, None], j[..., None, :]]
         return stats.trim_mean(table.reshape(*table.shape[:-2], -1), 0.25, axis=-1)
 
-    return _interval(drawn, statistic, resamples)
+    return bootstrap(drawn, statistic, resamples)
 
 
 def _checked(scores: np.ndarray) -> np.ndarray:
@@ -85,7 +85,7 @@ def _checked(scores: np.ndarray) -> np.ndarray:
     return scores
 
 
-def _interval(samples: tuple[np.ndarray, ...], statistic: Callable[..., Any], resamples: int) -> Estimate:
+def bootstrap(samples: tuple[np.ndarray, ...], statistic: Callable[..., Any], resamples: int) -> Estimate:
     """Return the statistic of samples, and its percentile interval when each sample is resampled."""
     result = stats.bootstrap(
         samples,

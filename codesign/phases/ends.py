@@ -17,10 +17,9 @@ import numpy as np
 from softgym_envs.agents.config import EnvironmentConfig
 from softgym_envs.agents.evaluation import Evaluation, make_agent
 from softgym_envs.agents.policy import Policy
-from softgym_envs.control.settling import settle
+from softgym_envs.control.settling import nearest_next, settle
 from softgym_envs.errors import ConfigError, ConvergenceError
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.robots.base import Robot
 
 
 @dataclass(frozen=True)
@@ -77,7 +76,8 @@ def run_ends(
     began, cpu = time.perf_counter(), time.process_time()
     points = np.asarray(goals, dtype=float)[:, -1]
     commands = final_commands(agent, start, points, design)
-    order = nearest_next(commands, environment.make_robot())
+    robot = environment.make_robot()
+    order = nearest_next(commands / (robot.upper - robot.lower))
     names = names or [f"goal {k + 1} of {len(points)}" for k in range(len(points))]
     found = _PendingGoals(environment, points, commands, order, dict(design), names)
     ended, unknowns = _settle(found) if agent == "qp" else _follow(found, agent, last_steps)
@@ -127,17 +127,6 @@ def episode_commands(
     finally:
         env.close()
     return found
-
-
-def nearest_next(commands: np.ndarray, robot: Robot) -> list[int]:
-    """Return an order of commands (k, n_a) with short ways: from rest to the nearest one, and so on."""
-    places, here = commands / (robot.upper - robot.lower), np.zeros(commands.shape[1])
-    left, order = list(range(len(places))), []
-    while left:
-        order.append(min(left, key=lambda k: float(np.linalg.norm(places[k] - here))))
-        left.remove(order[-1])
-        here = places[order[-1]]
-    return order
 
 
 @dataclass(frozen=True)

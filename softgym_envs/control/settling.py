@@ -91,3 +91,13 @@ def settle(
         if change <= tolerance:
             break
     return replace(found, change=change, equilibria=count)
+
+
+def nearest_next(points: np.ndarray) -> list[int]:
+    """Return an order of points (k, n) with short ways: from the origin to the nearest one, and so on."""
+    left, order, here = list(range(len(points))), [], np.zeros(points.shape[1])
+    while left:
+        order.append(min(left, key=lambda k: float(np.linalg.norm(points[k] - here))))
+        left.remove(order[-1])
+        here = points[order[-1]]
+    return order

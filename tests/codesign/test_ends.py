@@ -23,6 +23,7 @@ from softgym_envs.codesign.report.page import write_report
 from softgym_envs.codesign.report.statistics import mesh_part
 from softgym_envs.codesign.snapshot import load_study
 from softgym_envs.codesign.study import run_study
+from softgym_envs.control.settling import nearest_next
 from softgym_envs.errors import ConfigError, ConvergenceError
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.testing import wait_until
@@ -105,7 +106,7 @@ def test_a_step_that_fails_from_the_last_goal_starts_again_from_rest(run, follow
 def test_commands_are_taken_by_short_ways(diamond):
     robot = diamond.make_robot()
     commands = np.outer([0.9, 0.1, 0.5, 0.2], robot.upper)
-    assert ends.nearest_next(commands, robot) == [1, 3, 2, 0]
+    assert nearest_next(commands / (robot.upper - robot.lower)) == [1, 3, 2, 0]
 
 
 def test_unknown_means_survive_a_file(followed):

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from softgym_envs.control.inverse_qp import InverseQP
+from softgym_envs.control.settling import nearest_next
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 
 if TYPE_CHECKING:
@@ -81,7 +82,7 @@ def settle_on_fem(
     rows = np.full((len(goals), 3), np.nan)
     try:
         env.backend.reset(design)
-        for place in _tour(commands / span):
+        for place in nearest_next(commands / span):
             goal, command = goals[place], commands[place]
             state = env.backend.step(command)
             for _ in range(MAX_STEPS):
@@ -95,14 +96,3 @@ def settle_on_fem(
     except (ConvergenceError, InfeasibleDesign):
         return np.full_like(rows, np.nan)
     return rows
-
-
-def _tour(points: np.ndarray) -> list[int]:
-    """Return an order of points (n, m): from the origin, each time the nearest one that is left."""
-    left, order, here = list(range(len(points))), [], np.zeros(points.shape[1])
-    while left:
-        nearest = min(left, key=lambda place: float(np.abs(points[place] - here).max()))
-        left.remove(nearest)
-        order.append(nearest)
-        here = points[nearest]
-    return order

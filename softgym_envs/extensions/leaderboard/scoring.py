@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from softgym_envs.agents.statistics import Estimate
+from softgym_envs.agents.statistics import Estimate, bootstrap
 from softgym_envs.codesign.records import Record
 from softgym_envs.errors import DataError
 from softgym_envs.extensions.leaderboard.frozen import FrozenProblem
@@ -121,22 +121,20 @@ def improvement(first: np.ndarray, second: np.ndarray, *, resamples: int = 2000)
     (Agarwal et al. 2021).
 
     Args:
-        first: scores, shape (runs, problems).
-        second: scores, shape (other runs, problems).
+        first: scores, shape (runs, problems), with two runs or more.
+        second: scores, shape (other runs, problems), likewise.
         resamples: number of resamples.
     """
+    problems = first.shape[1]
 
-    def value(a: np.ndarray, b: np.ndarray) -> float:
-        difference = a[:, None, :] - b[None, :, :]
-        return float(np.mean((difference > 0.0) + 0.5 * (difference == 0.0)))
+    def statistic(*columns: np.ndarray, axis: int = -1) -> np.ndarray:
+        better = []
+        for a, b in zip(columns[:problems], columns[problems:], strict=True):
+            difference = a[..., :, None] - b[..., None, :]
+            better.append(((difference > 0.0) + 0.5 * (difference == 0.0)).mean(axis=(-2, -1)))
+        return np.mean(better, axis=0)
 
-    rng = np.random.default_rng(0)
-    drawn = []
-    for _ in range(resamples):
-        rows = [rng.integers(0, len(table), table.shape) for table in (first, second)]
-        drawn.append(value(*(np.take_along_axis(t, r, axis=0) for t, r in zip((first, second), rows, strict=True))))
-    low, high = np.percentile(drawn, [2.5, 97.5])
-    return Estimate(value(first, second), float(low), float(high))
+    return bootstrap((*first.T, *second.T), statistic, resamples)
 
 
 def bounds_share(problem: FrozenProblem, design: dict[str, float]) -> float:

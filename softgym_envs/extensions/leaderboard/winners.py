@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from softgym_envs.codesign.records import Record
+from softgym_envs.codesign.report.statistics import kendall_tau
 from softgym_envs.extensions.leaderboard.frozen import FrozenProblem, load_problem, problem_names
 from softgym_envs.extensions.leaderboard.runs import Run, stored_runs, tested
 from softgym_envs.extensions.leaderboard.scoring import DATA
@@ -110,13 +111,9 @@ def _at_rest(problem: FrozenProblem, design: dict[str, float], folder: Path) -> 
 
 def rank_correlation(rows: Sequence[Winner]) -> float:
     """Return Kendall's tau between the scores on both models; NaN for fewer than three winners."""
-    from scipy.stats import kendalltau
-
     pairs = [(row.surrogate, row.fem) for row in rows if row.fem is not None]
-    if len(pairs) < 3:
-        return np.nan
-    first, second = zip(*pairs, strict=True)
-    return float(kendalltau(first, second).statistic)
+    tau = kendall_tau([pair[0] for pair in pairs], [pair[1] for pair in pairs])
+    return np.nan if tau is None else tau
 
 
 def store(rows: Sequence[Winner], data: Path = DATA) -> Path:
