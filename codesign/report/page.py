@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import yaml
 from markupsafe import Markup
 
-from softgym_envs.codesign.report import interactive, plots, sentences, tables
+from softgym_envs.codesign.report import figures, motion, sentences, tables
 from softgym_envs.codesign.report.episodes import Episode, run_episodes
 from softgym_envs.codesign.report.exports import Download, write_exports
 from softgym_envs.codesign.report.files import write_results
@@ -22,6 +23,9 @@ from softgym_envs.errors import SoftGymError
 from softgym_envs.registry import Table
 from softgym_envs.storage import atomic_write
 from softgym_envs.wording import counted
+
+if TYPE_CHECKING:
+    from plotly.graph_objects import Figure
 
 
 @dataclass(frozen=True)
@@ -56,7 +60,7 @@ class TestSection:
     efforts: list[tables.EffortRow]
     missing: str
     measure: str
-    reached: str | None
+    reached: Markup | None
     goals_note: str
     effort_note: str
     mesh_note: str
@@ -65,10 +69,9 @@ class TestSection:
 
 @dataclass(frozen=True)
 class SearchSection:
-    """Figures of the search by title, interactive ones and pictures, and notes below them."""
+    """Figures of the search by title, and notes below them."""
 
-    interactive: list[tuple[str, Markup]]
-    pictures: list[tuple[str, str]]
+    figures: list[tuple[str, Markup]]
     notes: list[str]
 
 
@@ -77,7 +80,7 @@ class TransferSection:
     """The finalists on surrogate and FEM."""
 
     rows: list[tables.TransferRow]
-    picture: str | None
+    figure: Markup | None
     columns: list[str]
     finalists: list[tables.FinalistRow]
 
@@ -159,7 +162,7 @@ def _page(snapshot: StudySnapshot, results: StudyResults) -> Page:
     trial_columns, trials = tables.trial_table(snapshot, results)
     return Page(
         results=results,
-        plotly=Markup(interactive.plotly_code()),
+        plotly=Markup(figures.plotly_code()),
         headline=sentences.headline(snapshot, results),
         key_figures=sentences.key_figures(snapshot, results),
         findings=findings(snapshot, results),
@@ -178,22 +181,22 @@ def _page(snapshot: StudySnapshot, results: StudyResults) -> Page:
         trial_columns=trial_columns,
         trials=trials,
         config=yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False),
-        end_colours=plots.COLOURS,
+        end_colours=figures.COLOURS,
     )
 
 
 def _goal_section(
     snapshot: StudySnapshot, results: StudyResults, episodes: Sequence[Episode], downloads: Sequence[Download]
 ) -> GoalSection:
-    outcomes = interactive.goal_outcomes(snapshot, results)
-    views = [] if outcomes is None else interactive.goal_views(outcomes)
+    outcomes = motion.goal_outcomes(snapshot, results)
+    views = [] if outcomes is None else motion.goal_views(outcomes)
     film = next((file for file in downloads if file.name.endswith(".gif")), None)
     return GoalSection(
         count=results.comparison[0].goals if results.comparison else 0,
         radius=snapshot.config.distance_scale.limit_text(results.success_distance),
         legend=[] if outcomes is None else outcomes.legend,
-        views=[Markup(interactive.html(figure, f"goals-{plane}")) for plane, figure in views],
-        motion=Markup(interactive.html(interactive.motion(episodes, outcomes), "motion")) if episodes else "",
+        views=[Markup(figures.html(figure, f"goals-{plane}")) for plane, figure in views],
+        motion=Markup(figures.html(motion.motion(episodes, outcomes), "motion")) if episodes else "",
         episode=sentences.episode_text(episodes),
         film="" if film is None else film.href.replace("data:application/octet-stream", "data:image/gif"),
     )
@@ -207,7 +210,7 @@ def _test_section(snapshot: StudySnapshot, results: StudyResults) -> TestSection
         efforts=tables.effort_rows(results.comparison, config.effort),
         missing=results.no_winner or sentences.why_untested(snapshot, results),
         measure=config.distance.label.lower(),
-        reached=plots.reached(snapshot, results),
+        reached=_html(figures.reached(snapshot, results), "reached"),
         goals_note=sentences.goals_note(snapshot),
         effort_note=sentences.effort_note(snapshot),
         mesh_note=sentences.mesh_note(snapshot, results),
@@ -218,27 +221,18 @@ def _test_section(snapshot: StudySnapshot, results: StudyResults) -> TestSection
 def _search_section(snapshot: StudySnapshot, results: StudyResults) -> SearchSection:
     notes = sentences.search_notes(snapshot, results)
     if not any(trial.state == "complete" for trial in snapshot.trials):
-        return SearchSection([], [], notes)
-    figures = [
-        ("Every trial, and the best so far", "history", interactive.history(snapshot, results)),
-        ("The objective along each variable", "slices", interactive.slices(snapshot, results)),
-        ("Several objectives", "pareto", interactive.pareto(snapshot, results)),
-    ]
-    pictures = [
-        ("Learning in the trials", plots.curves(snapshot, results)),
-        ("Learning of the finalists, each with several seeds", plots.finalist_curves(snapshot, results)),
-        ("Bodies and their objective", plots.parallel(snapshot, results)),
-        ("Which variables matter", plots.importance(results)),
-        ("The inverse QP as a predictor of the trained controller", plots.screen(snapshot, results)),
-    ]
-    return SearchSection(
-        [(title, Markup(interactive.html(figure, name))) for title, name, figure in figures if figure is not None],
-        [(title, picture) for title, picture in pictures if picture is not None],
-        notes,
-    )
+        return SearchSection([], notes)
+    found = figures.search_figures(snapshot, results)
+    drawn = [(title, Markup(figures.html(figure, f"search-{k}"))) for k, (title, figure) in enumerate(found)]
+    return SearchSection(drawn, notes)
 
 
 def _transfer_section(snapshot: StudySnapshot, results: StudyResults) -> TransferSection:
     measures = snapshot.config.shown_objectives
     rows = [tables.transfer_row(row, measures[row.objective]) for row in results.transfer]
-    return TransferSection(rows, plots.transfer(snapshot, results), *tables.finalist_table(snapshot, results))
+    figure = _html(figures.transfer(snapshot, results), "transfer")
+    return TransferSection(rows, figure, *tables.finalist_table(snapshot, results))
+
+
+def _html(figure: Figure | None, name: str) -> Markup | None:
+    return None if figure is None else Markup(figures.html(figure, name))

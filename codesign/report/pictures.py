@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import base64
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
-from softgym_envs.codesign.report import plots
 from softgym_envs.codesign.report.results import StudyResults
 from softgym_envs.codesign.snapshot import StudySnapshot
 from softgym_envs.robots.base import Robot
@@ -23,13 +23,11 @@ class BodyPictures:
     Attributes:
         poses: captions of the poses.
         of_bodies: role of each body, and its picture in each pose.
-        overlay: both bodies over each other; None without pictures.
         missing: why there are no pictures; empty if there are some.
     """
 
     poses: list[str]
     of_bodies: list[tuple[str, list[str]]] = field(default_factory=list)
-    overlay: str | None = None
     missing: str = ""
 
 
@@ -41,8 +39,7 @@ def body_pictures(snapshot: StudySnapshot, results: StudyResults) -> BodyPicture
     poses = _poses(snapshot)
     captions = [caption for caption, _ in poses]
     try:
-        pictures, shapes = _photographs(snapshot.config.robot, bodies, poses)
-        return BodyPictures(captions, pictures, plots.overlay(shapes))
+        return BodyPictures(captions, _photographs(snapshot.config.robot, bodies, poses))
     except Exception as error:  # pictures need a working OpenGL, a report does not
         return BodyPictures(captions, missing=f"No pictures: {type(error).__name__}: {error}")
 
@@ -61,23 +58,24 @@ def _poses(snapshot: StudySnapshot) -> list[tuple[str, np.ndarray | None]]:
 
 def _photographs(
     robot: Robot, bodies: Mapping[str, dict[str, float]], poses: Sequence[tuple[str, np.ndarray | None]]
-) -> tuple[list[tuple[str, list[str]]], list[tuple[str, dict[str, Any]]]]:
-    """Return the pictures of each body, and what `plots.overlay` draws: all bodies in the first two poses."""
+) -> list[tuple[str, list[str]]]:
+    """Return the pictures of each body, in every pose."""
     from softgym_envs.viewer.image import ImageRenderer
-    from softgym_envs.viewer.surface import BodySurface
 
     renderer = ImageRenderer(robot, IMAGE_SIZE)
-    pictures: list[tuple[str, list[str]]] = []
-    shapes: list[tuple[str, dict[str, Any]]] = [(caption, {}) for caption, _ in poses[:2]]
     try:
-        for role, body in bodies.items():
-            pictures.append((role, []))
-            surface = BodySurface(renderer.shapes.load(body))
-            for index, (_, command) in enumerate(poses):
-                pictures[-1][1].append(plots.picture(renderer.render_body(body, command)))
-                if index < len(shapes):  # the renderer has just found this shape: asking for it again costs nothing
-                    points = surface.points(renderer.shapes.at(body, command))
-                    shapes[index][1][role] = (points, surface.triangles, renderer.shapes.state.effector)
+        return [
+            (role, [_source(renderer.render_body(body, command)) for _, command in poses])
+            for role, body in bodies.items()
+        ]
     finally:
         renderer.close()
-    return pictures, shapes
+
+
+def _source(image: np.ndarray) -> str:
+    """Return an image (h, w, 3) uint8 as WebP data for HTML."""
+    from PIL import Image
+
+    stream = io.BytesIO()
+    Image.fromarray(image).save(stream, format="webp", quality=85)
+    return f"data:image/webp;base64,{base64.b64encode(stream.getvalue()).decode()}"

@@ -10,11 +10,28 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.codesign.metrics.metric import Metric
-from softgym_envs.codesign.report.plots import BASELINE, MUTED, OTHER, STYLE, WINNER
 from softgym_envs.codesign.tools.records import CalibrationResult
 from softgym_envs.storage import atomic_write
 from softgym_envs.units import display
 from softgym_envs.wording import counted
+
+BASELINE, WINNER, OTHER, MUTED = "#64748b", "#0f766e", "#cbd5e1", "#94a3b8"
+STYLE: dict[Any, Any] = {
+    "font.family": "sans-serif",
+    "font.size": 9.5,
+    "axes.edgecolor": "#94a3b8",
+    "axes.labelcolor": "#334155",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e2e8f0",
+    "grid.linewidth": 0.8,
+    "xtick.color": "#475569",
+    "ytick.color": "#475569",
+    "legend.frameon": False,
+    "svg.hashsalt": "softgym-envs",
+}
 
 
 @contextmanager

@@ -12,8 +12,9 @@ from softgym_envs.agents.evaluation import Evaluation
 from softgym_envs.codesign.records import FinalistTest, TrialResult
 from softgym_envs.codesign.report.collect import collect
 from softgym_envs.codesign.report.episodes import typical_goal
+from softgym_envs.codesign.report.figures import search_figures
 from softgym_envs.codesign.report.findings import findings
-from softgym_envs.codesign.report.interactive import goal_outcomes, goal_views, history, slices
+from softgym_envs.codesign.report.motion import goal_outcomes, goal_views
 from softgym_envs.codesign.report.tables import effort_rows
 from softgym_envs.codesign.snapshot import load_study
 from softgym_envs.viewer.video import write_video
@@ -146,9 +147,14 @@ def test_outcomes_of_goals(tested):
 def test_plots_show_every_complete_trial(tested):
     snapshot = tested(FAR, FAR)
     results = collect(snapshot)
-    shown = [trace for trace in history(snapshot, results).data if trace.mode == "markers"]
-    assert {trace.name: list(trace.y) for trace in shown} == {"baseline": [5.0], "winner": [1.0]}
-    assert len([trace for trace in slices(snapshot, results).data if trace.name == "winner"]) == 2
+    drawn = dict(search_figures(snapshot, results))
+    history = drawn["Every trial, and the best so far"]
+    shown = {trace.name: list(trace.y) for trace in history.data if trace.mode == "markers"}
+    assert shown.pop("baseline") == [5.0] and shown.pop("winner") == [1.0]
+    assert [values for values in shown.values() if values] == [[5.0, 1.0]]  # Optuna's own trace of all trials
+    slices = drawn["The objective along each variable"]
+    assert len([trace for trace in slices.data if trace.name == "winner"]) == 2
+    assert "Bodies and their objective" in drawn
 
 
 def test_efforts_stand_in_the_report(tested):

@@ -216,7 +216,7 @@ def test_report_opens_in_a_browser(run, tmp_path, require_program):
         [CHROMIUM, *options, "--dump-dom", page.as_uri()], check=True, capture_output=True, text=True
     ).stdout
     assert f"winner-trial{results.winner.trial:04d}.stl" in dumped
-    assert dumped.count("data:image/webp") >= 4 and dumped.count("data:image/svg") >= 2
+    assert dumped.count("data:image/webp") >= 4
     assert dumped.count('class="main-svg"') >= 3  # plotly has drawn
     text = re.sub(r"<script.*?</script>", "", dumped, flags=re.DOTALL)
     assert 'src="http' not in text and 'href="http' not in text  # self-contained

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.agents.statistics import interquartile_mean
-from softgym_envs.codesign.report.plots import STYLE, draw_silhouette, silhouette
+from softgym_envs.codesign.tools.plots import STYLE
 from softgym_envs.extensions.leaderboard.frozen import load_problem, problem_names
 from softgym_envs.extensions.leaderboard.problem import BenchmarkProblem
 from softgym_envs.extensions.leaderboard.regret import EQUAL, Contest, Stored, contests
@@ -41,6 +41,7 @@ COLOURS = {
 BASELINE, BEST = "#ea580c", "#0f766e"
 """Colours of the outlines of bodies."""
 
+SILHOUETTE_HEIGHT = 350  # pixels
 SLENDER = 3.0
 """Length over width from which a body is drawn lying."""
 
@@ -208,3 +209,29 @@ def _changes(definition: BenchmarkProblem, best: Mapping[str, float]) -> list[st
         before, after = (present(value, variable.unit) for value in (definition.baseline_values[name], best[name]))
         lines.append(f"{name.replace('_', ' ')} {before.split()[0]} \N{RIGHTWARDS ARROW} {after}")
     return lines
+
+
+def silhouette(points: np.ndarray, triangles: np.ndarray, extent: np.ndarray) -> np.ndarray:
+    """Return the shadow of a body on a plane, as an image (h, w) of 0 and 1.
+
+    The body has points in the plane [m] (n, 2) and triangles (t, 3). ``extent`` holds two corners of the image [m],
+    shape (2, 2).
+    """
+    from PIL import Image, ImageDraw
+
+    scale = SILHOUETTE_HEIGHT / (extent[1, 1] - extent[0, 1])
+    image = Image.new("L", (round(scale * (extent[1, 0] - extent[0, 0])), SILHOUETTE_HEIGHT))
+    draw = ImageDraw.Draw(image)
+    for corners in (points[triangles] - extent[0]) * scale:
+        draw.polygon([(float(a), float(b)) for a, b in corners], fill=1)
+    return np.asarray(image)
+
+
+def draw_silhouette(
+    ax: Any, points: np.ndarray, triangles: np.ndarray, extent: np.ndarray, colour: str, opacity: float = 0.16
+) -> None:
+    """Draw the shadow of a body [mm] with its outline; points, triangles and extent are those of `silhouette`."""
+    image = silhouette(points, triangles, extent)
+    grid = [1e3 * np.linspace(extent[0, k], extent[1, k], n) for k, n in enumerate(reversed(image.shape))]
+    ax.contourf(*grid, image, levels=[0.5, 1.5], colors=[colour], alpha=opacity)
+    ax.contour(*grid, image, levels=[0.5], colors=[colour], linewidths=1.3)

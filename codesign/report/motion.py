@@ -1,4 +1,4 @@
-"""Interactive figures of a report: plotly, whose code the page contains, so that they work offline."""
+"""Figures of the goals that baseline and winner reach, and of both bodies in motion."""
 
 from __future__ import annotations
 
@@ -7,12 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softgym_envs.codesign.records import TrialResult
 from softgym_envs.codesign.report.episodes import Episode
-from softgym_envs.codesign.report.plots import BASELINE, COLOURS, MUTED, VIOLATES, WINNER
+from softgym_envs.codesign.report.figures import BASELINE, COLOURS, VIOLATES, WINNER, blank
 from softgym_envs.codesign.report.results import StudyResults
 from softgym_envs.codesign.snapshot import StudySnapshot
-from softgym_envs.units import display, present
 from softgym_envs.wording import decimal
 
 if TYPE_CHECKING:
@@ -29,154 +27,6 @@ GOAL_KINDS: tuple[tuple[str, str, str, str], ...] = (
     ("reached by neither", "x", VIOLATES, "✕"),
 )
 """Outcome of a goal, with the plotly symbol, the colour and the character of its marker."""
-
-_FONT = {"family": "system-ui, -apple-system, Segoe UI, Roboto, Helvetica Neue, Arial, sans-serif", "size": 12.5}
-_GRID = {"gridcolor": "#e2e8f0", "zeroline": False, "linecolor": "#94a3b8"}
-
-
-def plotly_code() -> str:
-    """Return the code of plotly, for a script element of the page (4.8 MB)."""
-    from plotly.offline import get_plotlyjs
-
-    return get_plotlyjs()
-
-
-def html(figure: Figure, name: str) -> str:
-    """Return a figure as an HTML element with the ID ``name``; the page has to contain `plotly_code` before it."""
-    from plotly.io import to_html
-
-    config = {"responsive": True, "displaylogo": False, "modeBarButtonsToRemove": ["lasso2d", "select2d"]}
-    return to_html(
-        figure, config, include_plotlyjs=False, full_html=False, div_id=name, default_width="100%", auto_play=False
-    )
-
-
-def _figure(height: int, **layout: Any) -> Figure:
-    from plotly.graph_objects import Figure, Layout
-
-    return Figure(
-        layout=Layout(
-            height=height,
-            font=_FONT,
-            template="none",
-            paper_bgcolor="#ffffff",
-            plot_bgcolor="#ffffff",
-            margin={"l": 62, "r": 16, "t": 16, "b": 52},
-            legend={"orientation": "h", "y": 1.02, "yanchor": "bottom"},
-            hoverlabel={"align": "left"},
-            **layout,
-        )
-    )
-
-
-# -- bodies of the search -------------------------------------------------------------------------------------------
-
-
-def _role(results: StudyResults, trial: TrialResult) -> str:
-    broken = "" if trial.feasible else "violates a constraint"
-    return results.roles.get(trial.number) or broken or "other bodies"
-
-
-_LOOKS = {
-    "other bodies": (MUTED, "circle", 8),
-    "violates a constraint": (VIOLATES, "x", 8),
-    "baseline": (BASELINE, "cross", 13),
-    "winner": (WINNER, "star", 16),
-}
-
-
-def _description(snapshot: StudySnapshot, results: StudyResults, trial: TrialResult) -> str:
-    """Return what a plot says of a body under the pointer."""
-    values = {**trial.design, **trial.options}
-    lines = [f"<b>trial {trial.number}</b> ({trial.origin})"]
-    for name in results.objectives:
-        objective = snapshot.config.objectives[name]
-        lines.append(f"{objective.label}: {objective.text(trial.values[name])}")
-    for variable in results.variables:
-        if variable.optimised:
-            lines.append(f"{variable.name.replace('_', ' ')}: {present(values[variable.name], variable.unit)}")
-    return "<br>".join(lines)
-
-
-def _scatter(
-    figure: Figure, snapshot: StudySnapshot, results: StudyResults, x: Any, y: Any, *, legend: bool = True, **place: int
-) -> None:
-    """Draw every complete trial; ``x`` and ``y`` map a trial to what the axes show."""
-    done = [trial for trial in snapshot.trials if trial.state == "complete"]
-    for role, (colour, symbol, size) in _LOOKS.items():
-        part = [trial for trial in done if _role(results, trial) == role]
-        if part:
-            figure.add_scatter(
-                x=[x(trial) for trial in part],
-                y=[y(trial) for trial in part],
-                mode="markers",
-                name=role,
-                legendgroup=role,
-                showlegend=legend,
-                text=[_description(snapshot, results, trial) for trial in part],
-                hovertemplate="%{text}<extra></extra>",
-                marker={"color": colour, "symbol": symbol, "size": size, "line": {"color": "#ffffff", "width": 0.8}},
-                **place,
-            )
-
-
-def history(snapshot: StudySnapshot, results: StudyResults) -> Figure:
-    """Objective of each trial, and the best so far."""
-    objective = snapshot.objective
-    figure = _figure(360, xaxis={"title": "trial", **_GRID}, yaxis={"title": objective.axis, **_GRID})
-    feasible = [trial for trial in snapshot.trials if trial.feasible]
-    if feasible:
-        best = objective.value_of(np.maximum.accumulate([trial.score or 0.0 for trial in feasible]))
-        numbers = [trial.number for trial in feasible]
-        line = {"shape": "hv", "color": WINNER, "width": 1.6}
-        figure.add_scatter(x=numbers, y=best, mode="lines", line=line, name="best so far", hoverinfo="skip")
-    _scatter(figure, snapshot, results, lambda t: t.number, lambda t: objective.value_of(t.score))
-    return figure
-
-
-def slices(snapshot: StudySnapshot, results: StudyResults) -> Figure:
-    """Objective against each variable that the study optimises."""
-    from plotly.subplots import make_subplots
-
-    objective = snapshot.objective
-    variables = [variable for variable in results.variables if variable.optimised]
-    columns = min(3, len(variables))
-    rows = -(-len(variables) // columns)
-    figure = make_subplots(rows, columns, shared_yaxes=True, vertical_spacing=0.3 / rows, horizontal_spacing=0.03)
-    figure.update_layout(_figure(70 + 270 * rows).layout)
-    for index, variable in enumerate(variables):
-        place = {"row": index // columns + 1, "col": index % columns + 1}
-
-        def value(trial: TrialResult, name: str = variable.name, unit: str = variable.unit) -> float:
-            return {**trial.design, **trial.options}[name] * display(unit).factor
-
-        _scatter(figure, snapshot, results, value, lambda t: objective.value_of(t.score), legend=index == 0, **place)
-        unit = display(variable.unit).unit
-        title = variable.name.replace("_", " ") + (f" [{unit}]" if unit else "")
-        figure.update_xaxes(title=title, type="log" if variable.log else "linear", **_GRID, **place)
-        figure.update_yaxes(title=objective.axis if index % columns == 0 else None, **_GRID, **place)
-    return figure
-
-
-def pareto(snapshot: StudySnapshot, results: StudyResults) -> Figure | None:
-    """Complete trials in the first two objectives, with the Pareto front; None with one objective."""
-    if len(results.objectives) < 2:
-        return None
-    first, second = (snapshot.config.objectives[name] for name in results.objectives[:2])
-    figure = _figure(400, xaxis={"title": first.axis, **_GRID}, yaxis={"title": second.axis, **_GRID})
-    points = {
-        t.number: (t.values[first.name] * first.scale, t.values[second.name] * second.scale)
-        for t in snapshot.trials
-        if t.scores
-    }
-    front = sorted(points[number] for number in results.pareto)
-    if front:
-        x, y = zip(*front, strict=True)
-        figure.add_scatter(
-            x=x, y=y, mode="lines", line={"color": WINNER, "width": 1.4}, name="Pareto front", hoverinfo="skip"
-        )
-    _scatter(figure, snapshot, results, lambda t: points[t.number][0], lambda t: points[t.number][1])
-    return figure
 
 
 # -- goals ----------------------------------------------------------------------------------------------------------
@@ -241,8 +91,8 @@ def goal_views(outcomes: GoalOutcomes) -> list[tuple[str, Figure]]:
     shown = [plane for plane in planes if all(spread[axis] > 1e-6 for axis in plane)] or planes[:1]
     views = []
     for a, b in shown:
-        axes = [{"title": f"{'xyz'[axis]} [mm]", **_GRID} for axis in (a, b)]
-        figure = _figure(330, showlegend=False, xaxis=axes[0], yaxis={**axes[1], "scaleanchor": "x"})
+        axes = [{"title": f"{'xyz'[axis]} [mm]"} for axis in (a, b)]
+        figure = blank(330, showlegend=False, xaxis=axes[0], yaxis={**axes[1], "scaleanchor": "x"})
         for role, ends in outcomes.ends.items():
             starts = np.broadcast_to(outcomes.points, ends.shape).reshape(-1, 3)
             lines = 1e3 * np.stack([starts, ends.reshape(-1, 3)], axis=1)
@@ -288,7 +138,7 @@ def motion(episodes: Sequence[Episode], outcomes: GoalOutcomes | None) -> Figure
     points = max(len(surface.nodes) for surface in surfaces)
     count = max(2, min(MAX_FRAMES, max(len(e.states) for e in episodes), MAX_POINTS // points))
     picks = [episode.pick(count) for episode in episodes]
-    figure = _figure(560, scene=_scene(), uirevision="constant")
+    figure = blank(560, scene=_scene(), uirevision="constant")
 
     def traces(frame: int, whole: bool) -> list[dict[str, Any]]:
         drawn: list[dict[str, Any]] = []
