@@ -184,7 +184,7 @@ def _of_trials(snapshot: StudySnapshot, results: StudyResults) -> Iterator[tuple
         for start in range(0, len(shown.names), WIDE):
             part = shown.names[start : start + WIDE]
             figure = styled(visualization.plot_slice(shown.study, part, **named), 340)
-            for column, name in enumerate(part, start=1):
+            for column, name in enumerate(sorted(part), start=1):  # as Optuna does
                 place = {} if len(part) == 1 else {"row": 1, "col": column}
                 shown.mark(
                     figure,
