@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from softgym_envs.codesign.report.plots import BASELINE, OTHER, STYLE, WINNER
 from softgym_envs.codesign.tools.measurements import Measurements
+from softgym_envs.codesign.tools.plots import BASELINE, OTHER, STYLE, WINNER
 from softgym_envs.codesign.tools.records import CalibrationResult
 from softgym_envs.storage import atomic_write
 from softgym_envs.units import display

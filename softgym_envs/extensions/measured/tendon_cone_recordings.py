@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from softgym_envs.codesign.report.plots import BASELINE, WINNER
 from softgym_envs.codesign.tools.calibration import calibrate, fitted_units, predicted
 from softgym_envs.codesign.tools.config import CalibrationConfig
 from softgym_envs.codesign.tools.fit_page import Page, Picture, Table, drawn, parameter_table
 from softgym_envs.codesign.tools.measurements import Measurements
+from softgym_envs.codesign.tools.plots import BASELINE, WINNER
 from softgym_envs.config import check_config
 from softgym_envs.errors import DataError
 from softgym_envs.extensions.measured.comparison import SOURCES, Comparison, Line, files_in
