@@ -38,6 +38,10 @@ class ConvergenceError(SoftGymError):
         self.fraction = fraction
 
 
+class ImpossibleState(ConvergenceError, InfeasibleDesign):
+    """An equilibrium of the equations that no body has: walls passed through each other, or cells turned inside out."""
+
+
 class DataError(SoftGymError):
     """A dataset, mesh or result file is missing, truncated, corrupted or of the wrong version."""
 

@@ -38,6 +38,7 @@ from softgym_envs.mechanics.solids import (
     PerElement,
     are_rows,
     check_distance,
+    check_guides,
     check_modulus,
     check_size,
     described,
@@ -179,8 +180,7 @@ class MechanicalModel:
                 merged, and faces that lie on each other. False allows cuts of no width.
 
         Raises:
-            ValueError: with the place and the remedy, for a mesh that is no body, clamps that do not hold it, or
-                wrong arguments.
+            ValueError: for a mesh that is no body, clamps that do not hold it, or wrong arguments.
         """
         part = solid_part(
             nodes,
@@ -311,20 +311,21 @@ class MechanicalModel:
             pull_point: fixed point where the cable leaves the body [m], shape (3,).
             unilateral: True for a real cable, which cannot push.
             hint: elements from which guides outside the mesh are extrapolated, shape (p,).
-            block: number of the solid among `solids`.
+            block: its number among `solids`.
             radius: of the channel's part on which a guide acts [m], see `embed`.
 
         Raises:
-            ValueError: if a guide is farther from the body than its size, or the pull point than ten times its size, or
-                the pull point is not three finite numbers.
+            ValueError: if a guide without a hint lies an element's length outside the body, or the pull point ten times
+                its size, or not at three finite numbers.
         """
         origin = np.asarray(pull_point, dtype=float)
         if origin.shape != (3,) or not np.isfinite(origin).all():
             raise ValueError(f"the pull point of cable '{name}' must be three finite numbers, got {origin.tolist()}")
         check_distance(origin, self._solid_nodes, f"the pull point of cable '{name}'", 10.0)
         embedding = self.embed(points, hint, block=block, name=f"a guide of cable '{name}'", radius=radius)
-        cable = Cable(name, embedding, origin, unilateral=unilateral)
-        self.add("a", cable)
+        if hint is None and not radius:
+            check_guides(embedding, self.nodes, f"a guide of cable '{name}'")
+        self.add("a", cable := Cable(name, embedding, origin, unilateral=unilateral))
         return cable
 
     def add_tendon(self, name: str, places: ArrayLike, offsets: ArrayLike, *, rod: int = 0, **options: Any) -> Cable:
@@ -441,14 +442,14 @@ class MechanicalModel:
         excluded: Sequence[int] | np.ndarray = (),
         settings: ContactSettings | None = None,
     ) -> Contact:
-        """Let the surface of the body touch obstacles and itself; solvers made afterwards include it.
+        """Let the surface of the body touch obstacles and, unless settings say no, itself.
 
-        Call it when all parts and skins have been added.
+        Call it when all parts and skins have been added; solvers made afterwards include it.
 
         Args:
             obstacles: what the body touches, each with its coefficient of friction.
             excluded: rows whose triangles touch nothing, e.g. nodes clamped inside a mount that is not modelled.
-            settings: self-contact, and the law of contact; default `ContactSettings`.
+            settings: self-contact, and the law of contact; by default the body touches itself too.
 
         Raises:
             ValueError: if there is no Young's modulus to choose the stiffness of contact from, or for excluded rows
@@ -459,7 +460,7 @@ class MechanicalModel:
             raise ValueError(
                 f"'excluded' must be numbers of rows from 0 to {len(self.nodes) - 1}, got {described(excluded)}"
             )
-        settings = ContactSettings() if settings is None else settings
+        settings = ContactSettings(self_contact=True) if settings is None else settings
         if settings.stiffness is None:
             stiffness = 0.1 * max((block.largest_young_modulus for block in self.blocks), default=0.0)
             if not stiffness:

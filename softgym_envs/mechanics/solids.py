@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from softgym_envs.errors import unknown_name
+from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.elements.averaged import AveragedTetrahedra
 from softgym_envs.mechanics.elements.quadratic import EDGES, QuadraticTetrahedra, add_midside_nodes
 from softgym_envs.mechanics.elements.tetrahedra import SolidBlock, Tetrahedra, check_nodes
@@ -177,6 +178,34 @@ def check_distance(points: np.ndarray, nodes: np.ndarray, name: str, sizes: floa
         raise ValueError(
             f"{name} at {points[worst].tolist()} m lies {away[worst]:.3g} m outside the body, "
             f"which is {size:.3g} m long; did you mean metres?"
+        )
+
+
+def check_guides(guides: EmbeddedPoints, nodes: np.ndarray, name: str) -> None:
+    """Reject points that are extrapolated from an element farther away than it is long.
+
+    Args:
+        guides: points in elements, with their corners.
+        nodes: of the body [m], shape (n, 3).
+        name: what the points are, for the message.
+
+    Raises:
+        ValueError: with the point that lies farthest outside.
+    """
+    corners = nodes[guides.node_ids[:, :4]]
+    edges = np.linalg.norm(corners[:, [0, 0, 0, 1, 1, 2]] - corners[:, [1, 2, 3, 2, 3, 3]], axis=2).max(axis=1)
+    barycentric = np.linalg.solve(
+        np.concatenate([np.ones((len(corners), 1, 4)), np.swapaxes(corners, 1, 2)], axis=1),
+        np.column_stack([np.ones(len(corners)), guides.points])[..., None],
+    )[..., 0]
+    inside = barycentric.clip(min=0.0)
+    nearest = np.einsum("pk,pkd->pd", inside / inside.sum(axis=1, keepdims=True), corners)
+    away = np.linalg.norm(guides.points - nearest, axis=1)
+    worst = int(np.argmax(away - edges))
+    if away[worst] > edges[worst]:
+        raise ValueError(
+            f"{name} at {np.round(guides.points[worst], 6).tolist()} m lies {away[worst]:.3g} m outside the body; pass "
+            "'hint', the element that carries it, if that is meant"
         )
 
 

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from softgym_envs.errors import InfeasibleDesign
+from softgym_envs.errors import ImpossibleState, InfeasibleDesign
 from softgym_envs.mechanics.compilation import njit
 from softgym_envs.mechanics.constraints.cavity import Cavity, SealedAir, enclosed_volume
 from softgym_envs.mechanics.constraints.constraint import Constraint
+from softgym_envs.mechanics.elements.gas import EnclosedGas
 from softgym_envs.mechanics.elements.tetrahedra import boundary_triangles
+
+if TYPE_CHECKING:
+    from softgym_envs.mechanics.model import MechanicalModel
 
 
 def connected_pieces(triangles: np.ndarray) -> list[np.ndarray]:
@@ -158,22 +163,39 @@ def cavity_like(
 @njit(cache=True, error_model="numpy")
 def _pierces(start, end, a, b, c, tolerance):
     """Whether the open segment from ``start`` to ``end`` crosses the inside of a triangle (Moeller and Trumbore)."""
-    direction, u, v, s = end - start, b - a, c - a, start - a
-    across = np.cross(direction, v)
-    determinant = u @ across
-    size = np.sqrt((direction @ direction) * (u @ u) * (v @ v))
-    if abs(determinant) <= tolerance * size:  # parallel
+    d0, d1, d2 = end[0] - start[0], end[1] - start[1], end[2] - start[2]
+    u0, u1, u2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    v0, v1, v2 = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+    p0, p1, p2 = d1 * v2 - d2 * v1, d2 * v0 - d0 * v2, d0 * v1 - d1 * v0
+    determinant = u0 * p0 + u1 * p1 + u2 * p2
+    square = (d0 * d0 + d1 * d1 + d2 * d2) * (u0 * u0 + u1 * u1 + u2 * u2) * (v0 * v0 + v1 * v1 + v2 * v2)
+    if determinant * determinant <= tolerance * tolerance * square:  # parallel
         return False
-    turned = np.cross(s, u)
-    first, second, along = (s @ across) / determinant, (direction @ turned) / determinant, (v @ turned) / determinant
-    low = min(min(first, second), min(1.0 - first - second, min(along, 1.0 - along)))
-    return low > tolerance
+    inverse = 1.0 / determinant
+    s0, s1, s2 = start[0] - a[0], start[1] - a[1], start[2] - a[2]
+    first = inverse * (s0 * p0 + s1 * p1 + s2 * p2)
+    if first <= tolerance or first >= 1.0 - tolerance:
+        return False
+    t0, t1, t2 = s1 * u2 - s2 * u1, s2 * u0 - s0 * u2, s0 * u1 - s1 * u0
+    second = inverse * (d0 * t0 + d1 * t1 + d2 * t2)
+    if second <= tolerance or first + second >= 1.0 - tolerance:
+        return False
+    along = inverse * (v0 * t0 + v1 * t1 + v2 * t2)
+    return along > tolerance and along < 1.0 - tolerance
 
 
 @njit(cache=True, error_model="numpy")
-def _first_crossing(points, triangles, order, low, high, tolerance):
-    """Two triangles that cross each other, or (-1, -1). ``order`` sorts them by ``low`` along the first axis."""
+def _first_crossing(points, triangles, axis, tolerance):
+    """Two triangles that cross each other, or (-1, -1); they are compared in their order along an axis."""
     count = triangles.shape[0]
+    low, high = np.empty((count, 3)), np.empty((count, 3))
+    for t in range(count):
+        a, b, c = triangles[t]
+        for d in range(3):
+            e = (axis + d) % 3
+            p, q, r = points[a, e], points[b, e], points[c, e]
+            low[t, d], high[t, d] = min(p, min(q, r)), max(p, max(q, r))
+    order = np.argsort(low[:, 0])
     for m in range(count):
         i = order[m]
         for n in range(m + 1, count):
@@ -182,24 +204,83 @@ def _first_crossing(points, triangles, order, low, high, tolerance):
                 break
             if low[j, 1] > high[i, 1] or low[i, 1] > high[j, 1] or low[j, 2] > high[i, 2] or low[i, 2] > high[j, 2]:
                 continue
+            common = 0
+            for k in range(3):
+                p = triangles[i, k]
+                common += p == triangles[j, 0] or p == triangles[j, 1] or p == triangles[j, 2]
+            if common >= 2:  # every edge begins or ends on the other triangle, and so only touches it
+                continue
             for first, second in ((i, j), (j, i)):
-                t, u = triangles[first], triangles[second]
+                u0, u1, u2 = triangles[second]
                 for k in range(3):
-                    p, q = t[k], t[(k + 1) % 3]
-                    # An edge that begins or ends on the other triangle only touches it.
-                    if p != u[0] and p != u[1] and p != u[2] and q != u[0] and q != u[1] and q != u[2]:
-                        if _pierces(points[p], points[q], points[u[0]], points[u[1]], points[u[2]], tolerance):
+                    p, q = triangles[first, k], triangles[first, (k + 1) % 3]
+                    if p != u0 and p != u1 and p != u2 and q != u0 and q != u1 and q != u2:
+                        if _pierces(points[p], points[q], points[u0], points[u1], points[u2], tolerance):
                             return i, j
     return -1, -1
 
 
 def self_intersection(points: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
     """Return a point [m] (3,) where triangles (k, 3) cross each other, or None. Touching is allowed."""
-    corners = points[triangles]
-    axes = np.argsort(-np.ptp(points, axis=0))  # few triangles overlap along the longest side
-    low, high = corners.min(axis=1)[:, axes], corners.max(axis=1)[:, axes]
-    i, j = _first_crossing(points, triangles, np.argsort(low[:, 0]), low, high, 1e-9)
-    return None if i < 0 else 0.5 * (corners[i].mean(axis=0) + corners[j].mean(axis=0))
+    axis = int(np.argmax(np.ptp(points[triangles[:, 0]], axis=0)))  # few triangles overlap along the longest side
+    i, j = _first_crossing(points, triangles, axis, 1e-9)
+    return None if i < 0 else 0.5 * (points[triangles[i]].mean(axis=0) + points[triangles[j]].mean(axis=0))
+
+
+@njit(cache=True, error_model="numpy")
+def _inside_out(x, tetrahedra):
+    """The first tetrahedron (m, 4) of the corners whose volume is not positive, or -1."""
+    for e in range(tetrahedra.shape[0]):
+        o, a, b, c = tetrahedra[e]
+        u0, u1, u2 = x[a, 0] - x[o, 0], x[a, 1] - x[o, 1], x[a, 2] - x[o, 2]
+        v0, v1, v2 = x[b, 0] - x[o, 0], x[b, 1] - x[o, 1], x[b, 2] - x[o, 2]
+        w0, w1, w2 = x[c, 0] - x[o, 0], x[c, 1] - x[o, 1], x[c, 2] - x[o, 2]
+        if u0 * (v1 * w2 - v2 * w1) + u1 * (v2 * w0 - v0 * w2) + u2 * (v0 * w1 - v1 * w0) <= 0.0:
+            return e
+    return -1
+
+
+class ShapeCheck:
+    """Whether a state can be one: no wall of a cavity has passed through another, and no cell is inside out.
+
+    Elements whose Gauss points alone are kept from turning inside out are checked by their corners.
+
+    Args:
+        cavities: whose walls do not touch each other in the model.
+        cells: corners of such elements, shapes (m, 4).
+    """
+
+    def __init__(self, cavities: Iterable[Cavity], cells: Iterable[np.ndarray]) -> None:
+        self._cavities = [(each, np.ascontiguousarray(each.flat_triangles)) for each in cavities]
+        self._cells = [np.ascontiguousarray(each) for each in cells]
+
+    @classmethod
+    def of(cls, model: MechanicalModel) -> ShapeCheck:
+        """Return the check of a model. With self-contact, walls cannot pass through each other."""
+        sealed = [block.air.cavity for block in model.blocks if isinstance(block, EnclosedGas)]
+        rows = [c.cavity if isinstance(c, SealedAir) else c for group in "as" for c in model.constraints[group]]
+        cavities = {id(each): each for each in [*rows, *sealed] if isinstance(each, Cavity)}
+        touching = model.contact is not None and model.contact.self_contact
+        cells = [block.corners for block in model.solids if block.points > 1]
+        return cls([] if touching else cavities.values(), cells)
+
+    def check(self, x: np.ndarray) -> None:
+        """Check the rows of a state [m], shape (n, 3).
+
+        Raises:
+            ImpossibleState: with the cavity or cell, and the place.
+        """
+        for cavity, triangles in self._cavities:
+            if (place := self_intersection(x, triangles)) is not None:
+                raise ImpossibleState(
+                    f"the walls of '{cavity.name}' pass through each other near {np.round(place, 4).tolist()} m, "
+                    "because they do not touch each other in this model; let them touch with "
+                    "set_contact(settings=ContactSettings(self_contact=True))"
+                )
+        for cells in self._cells:
+            if (cell := _inside_out(x, cells)) >= 0:
+                place = np.round(x[cells[cell]].mean(axis=0), 4).tolist()
+                raise ImpossibleState(f"element {cell} near {place} m has turned inside out; refine the mesh there")
 
 
 def check_cavities(cavities: Iterable[Constraint], x: np.ndarray) -> None:

@@ -22,7 +22,7 @@ from typing import Unpack
 
 import numpy as np
 
-from softgym_envs.errors import ConvergenceError
+from softgym_envs.errors import ConvergenceError, ImpossibleState
 from softgym_envs.mechanics.assembly import Inertia, MassAndDamping
 from softgym_envs.mechanics.contact.contact import ContactMemory
 from softgym_envs.mechanics.model import MechanicalModel
@@ -233,8 +233,10 @@ class Dynamics(Statics):
                     part = target if k == count - 1 else first + (k + 1) / count * (target - first)
                     found = self._advance(part, mode, self.step / count, applied)
                 break
-            except ConvergenceError:
+            except ConvergenceError as problem:
                 self.snapshot = start
+                if isinstance(problem, ImpossibleState):
+                    raise
                 if cut == self.max_cuts:
                     raise ConvergenceError(
                         f"cannot advance {self.step:g} s to actuators {target.tolist()}, even in {count} steps",

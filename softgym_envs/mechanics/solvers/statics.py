@@ -19,7 +19,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from softgym_envs.errors import ConvergenceError, no_equilibrium
+from softgym_envs.errors import ConvergenceError, ImpossibleState, no_equilibrium
 from softgym_envs.mechanics.assembly import Assembled
 from softgym_envs.mechanics.condensation import ContactModel
 from softgym_envs.mechanics.contact.contact import ContactMemory
@@ -42,6 +42,7 @@ from softgym_envs.mechanics.solvers.equilibrium import (
 from softgym_envs.mechanics.solvers.linearisation import Linearisation
 from softgym_envs.mechanics.solvers.penalty import Penalty
 from softgym_envs.mechanics.solvers.prediction import Bend, Steps
+from softgym_envs.mechanics.surfaces import ShapeCheck
 
 MAX_SIMPLIFIED = 3
 """Simplified Newton corrections that together take less time than a factorisation and what it needs."""
@@ -97,7 +98,7 @@ class Statics:
         if self.compliance.any() and model.contact is not None:
             raise ValueError("drives with compliance are computed without contact only; allowed: compliance = 0")
         self._elasticity_version = model.elasticity_version
-        self._layout = RowLayout.of(model)
+        self._layout, self._shape = RowLayout.of(model), ShapeCheck.of(model)
         self._compiled, self._lumped = compiled, False
         self._beams: BeamMotion | None = None
         used = np.unique(np.concatenate([block.nodes_used for block in model.blocks]))  # not the directors of frames
@@ -439,7 +440,8 @@ class Statics:
             larger than commanded, and their effort is zero.
 
         Raises:
-            ConvergenceError: if no equilibrium is found; the last converged state is kept.
+            ConvergenceError: if no equilibrium is found, or walls of cavities or cells are inside out there
+                (`ImpossibleState`); the last converged state is kept.
             ValueError: for a wrong shape, a non-finite value, an unknown mode, or a negative effort on an actuator that
                 cannot push.
         """
@@ -473,7 +475,7 @@ class Statics:
             raise ConvergenceError("the starting state has inverted elements or a singular tangent", fraction=0.0)
 
         # Commands are ramped from the current values.
-        start = self.effort.copy()
+        before, start = self.snapshot, self.effort.copy()
         start[driven] = (linear.delta + self.compliance * start)[driven]
         done, size, iterations, increments = 0.0, 1.0, 0, 0
         while done < 1.0:
@@ -505,6 +507,11 @@ class Statics:
             if linear.has_friction:
                 self._accept()
                 found = replace(found, memory=self.memory)
+        try:
+            self._shape.check(self.x)
+        except ImpossibleState:
+            self.snapshot = before
+            raise
         return found
 
     def contact_model(self, *, each_point: bool = False, friction: bool = False) -> ContactModel:

@@ -1,0 +1,130 @@
+"""Equilibria of the equations that no body has: walls that passed through each other, and cells turned inside out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from softgym_envs.errors import ConvergenceError, ImpossibleState
+from softgym_envs.mechanics.contact.contact import ContactSettings
+from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.mechanics.solvers.dynamics import Dynamics
+from softgym_envs.mechanics.solvers.statics import Statics
+from softgym_envs.mechanics.surfaces import ShapeCheck, self_intersection
+from softgym_envs.testing import box_mesh
+
+INSIDE = [0.03, 0.03, 0.00275]
+
+
+def pad(**options):
+    """A plate of 60 x 60 x 5.5 mm with a chamber 1.5 mm high, clamped at both ends."""
+    nodes, tetrahedra = box_mesh((0.06, 0.06, 3.0), (8, 8, 3))
+    centre = nodes[tetrahedra].mean(axis=1)
+    hollow = (np.abs(centre[:, :2] - 0.03) < 0.0225).all(axis=1) & (np.abs(centre[:, 2] - 1.5) < 0.5)
+    heights = np.array([0.0, 2e-3, 3.5e-3, 5.5e-3])
+    nodes[:, 2] = heights[np.rint(nodes[:, 2]).astype(int)]
+    kept, local = np.unique(tetrahedra[~hollow], return_inverse=True)
+    nodes = nodes[kept]
+    fixed = (nodes[:, 0] < 1e-9) | (nodes[:, 0] > 0.06 - 1e-9)
+    return MechanicalModel.from_mesh(
+        nodes, local.reshape(-1, 4), fixed=fixed, young_modulus=2e5, element="averaged", check=True, **options
+    )
+
+
+def test_walls_of_a_driven_chamber_that_cross_are_no_equilibrium():
+    model = pad()
+    cavity = model.add_cavity("chamber", inside=INSIDE)
+    solver = Statics(model)
+    held = solver.solve([-50.0], "effort")
+    assert self_intersection(held.x, cavity.flat_triangles) is None
+    with pytest.raises(ImpossibleState, match=r"the walls of 'chamber' pass through each other near .* m, .*self_con"):
+        solver.solve([-400.0], "effort")
+    np.testing.assert_array_equal(solver.x, held.x)  # the last state is kept
+    np.testing.assert_array_equal(solver.effort, held.effort)
+    again = solver.solve([-55.0], "effort")
+    assert again.effort[0] == -55.0
+
+
+def test_a_step_in_time_stops_at_once_where_walls_cross():
+    model = pad(density=1100.0)
+    model.add_cavity("chamber", inside=INSIDE)
+    motion = Dynamics(model, step=0.02, stiffness_damping=1e-3)
+    with pytest.raises(ConvergenceError, match="the walls of 'chamber' pass through each other"):
+        for _ in range(20):
+            motion.advance([-400.0], "effort")
+
+
+def test_walls_that_touch_are_left_to_contact():
+    model = pad()
+    cavity = model.add_cavity("chamber", inside=INSIDE)
+    assert model.set_contact().self_contact
+    assert not model.set_contact(settings=ContactSettings()).self_contact
+    model.set_contact(settings=ContactSettings(self_contact=True, distance=4e-4))
+    found = Statics(model).solve([-400.0], "effort")
+    assert self_intersection(found.x, cavity.flat_triangles) is None
+    assert found.contacts.self_force > 0.0
+
+
+@pytest.mark.parametrize("role", ["s", "sealed"])
+def test_measured_and_sealed_chambers_are_checked_too(role):
+    model = pad()
+    found = model.cavity("chamber", pad().add_cavity("c", inside=INSIDE).triangles)
+    if role == "s":
+        model.add("s", found)
+    else:
+        model.seal(found)
+    x = model.nodes.copy()
+    upper = np.isclose(x[:, 2], 3.5e-3) & (np.abs(x[:, :2] - 0.03) < 0.02).all(axis=1)
+    x[upper] += [7e-4, 4e-4, -2.5e-3]
+    check = ShapeCheck.of(model)
+    check.check(model.nodes)
+    with pytest.raises(ImpossibleState, match="the walls of 'chamber' pass through each other"):
+        check.check(x)
+
+
+def test_a_quadratic_cell_that_is_inside_out_is_no_state():
+    nodes, tetrahedra = box_mesh((0.04, 0.02, 0.02), (2, 1, 1))
+    model = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=lambda x: x[:, 0] < 1e-9, element="quadratic")
+    check = ShapeCheck.of(model)
+    turned = model.nodes @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    check.check(turned)
+    check.check(1.3 * model.nodes)
+    x = model.nodes.copy()
+    x[0] = [0.021, 0.021, 0.021]  # a corner pushed through its opposite faces
+    with pytest.raises(
+        ImpossibleState, match=r"element \d+ near \[.*\] m has turned inside out; refine the mesh there"
+    ):
+        check.check(x)
+
+
+def test_crossings_by_brute_force():
+    """The search along one axis finds a crossing exactly where a comparison of all pairs does."""
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        points = rng.standard_normal((18, 3)) * [1.0, 2.0, 3.0]
+        triangles = np.arange(18).reshape(6, 3)
+        crossing = False
+        for i in range(6):
+            for j in range(6):
+                a, b, c = points[triangles[j]]
+                for k in range(3):
+                    p, q = points[triangles[i, k]], points[triangles[i, (k + 1) % 3]]
+                    try:
+                        u, v, t = np.linalg.solve(np.column_stack([b - a, c - a, p - q]), p - a)
+                    except np.linalg.LinAlgError:
+                        continue
+                    crossing |= i != j and min(u, v, 1 - u - v, t, 1 - t) > 0.0
+        assert (self_intersection(points, triangles) is not None) == crossing
+
+
+def test_a_guide_outside_the_body():
+    nodes, tetrahedra = box_mesh((0.1, 0.02, 0.02), (10, 2, 2))
+    model = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=nodes[:, 0] == 0.0)
+    far = [[0.02, 0.01, 0.015], [0.09, 0.01, 0.05]]
+    with pytest.raises(
+        ValueError, match=r"a guide of cable 'c' at \[0.09, .* m lies 0.03\d* m outside the body; pass 'h"
+    ):
+        model.add_cable("c", far, [0, 0.01, 0.05])
+    assert not model.rows
+    model.add_cable("lug", [[0.02, 0.01, 0.024], [0.09, 0.01, 0.024]], [0, 0.01, 0.024])
+    model.add_cable("meant", far, [0, 0.01, 0.05], hint=np.array([0, len(tetrahedra) - 1]))
