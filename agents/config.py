@@ -20,8 +20,8 @@ from softgym_envs.config import BesideConfig, Config, first_problem
 from softgym_envs.envs.options import EnvironmentOptions, default_backend, set_up
 from softgym_envs.envs.registration import EnvironmentRow, find_row
 from softgym_envs.envs.tasks.registry import TASKS, make_task
-from softgym_envs.registry import class_path
-from softgym_envs.robots.registry import make_robot
+from softgym_envs.registry import allow_code, class_path, is_place
+from softgym_envs.robots.registry import ROBOTS, make_robot
 
 if TYPE_CHECKING:
     import gymnasium
@@ -76,6 +76,7 @@ class EnvironmentConfig(Config):
         if not isinstance(data, dict):
             return data
         paths = {name: class_path(data[name]) for name in ("robot", "task") if isinstance(data.get(name), type)}
+        allow_code(*paths.values())
         return {**data, **paths}
 
     @model_validator(mode="after")
@@ -85,6 +86,8 @@ class EnvironmentConfig(Config):
         if self.id is not None and (self.robot is not None or self.task is not None):
             raise ValueError("an environment takes an id, or a robot and a task, not both")
         row = self.row  # checks the ID, or the task
+        if is_place(self.robot):
+            ROBOTS.class_of(self.robot)
         if "backend" not in self.model_fields_set:
             backend = row.backend or default_backend(self.make_robot(), self.backend_options)
             object.__setattr__(self, "backend", backend)

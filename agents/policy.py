@@ -13,7 +13,7 @@ from softgym_envs.config import check_config
 from softgym_envs.envs.options import design_names
 from softgym_envs.errors import ConfigError, DataError, WeightsError, unknown_name
 from softgym_envs.registry import class_path
-from softgym_envs.storage import atomic_write, read_json, write_json
+from softgym_envs.storage import atomic_write, hash_of, read_json, write_json
 
 FORMAT = 1
 
@@ -49,7 +49,7 @@ def save_policy(path: Path, tensors: dict[str, np.ndarray], card: dict[str, Any]
 
     with atomic_write(path) as stream:
         stream.write(save({k: np.ascontiguousarray(v) for k, v in tensors.items()}))
-    write_json(path.with_suffix(".json"), {"format": FORMAT, **card})
+    write_json(path.with_suffix(".json"), {"format": FORMAT, **card, "sha256": hash_of(path)})
 
 
 def read_tensors(path: str | Path) -> dict[str, np.ndarray]:
@@ -130,6 +130,8 @@ class Policy:
             self.environment = check_config(EnvironmentConfig, config["environment"], f"policy card '{card}'")
         except ConfigError as error:
             raise WeightsError(str(error)) from None
+        if self.card.get("sha256") != hash_of(self.path):
+            raise WeightsError(f"policy '{self.path}' is damaged, or not that of the card beside it")
         try:
             self.hidden: list[Layer] = []
             self.memory: tuple[Layer, Layer] | None = None

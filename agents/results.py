@@ -16,6 +16,7 @@ from softgym_envs.agents.baselines import BASELINES
 from softgym_envs.agents.config import EnvironmentConfig
 from softgym_envs.agents.learners import LEARNERS
 from softgym_envs.agents.statistics import Estimate, crossed_estimate, stratified_estimate
+from softgym_envs.config import check_config
 from softgym_envs.errors import DataError
 from softgym_envs.storage import read_json
 
@@ -78,7 +79,7 @@ class StoredRun:
         expected = {"seed", "config", "curve", "evaluations", "horizon"}
         if not isinstance(run, dict) or not expected <= run.keys():
             raise DataError(f"'{path}' is not the result of a training: it must contain {', '.join(sorted(expected))}")
-        environment = EnvironmentConfig.model_validate(run["config"]["environment"])
+        environment = check_config(EnvironmentConfig, run["config"]["environment"], f"'{path}'")
         learner = run["config"].get("learner", "sac")  # the only one there was before
         return cls(run["seed"], learner, environment, run["curve"], run["evaluations"])
 

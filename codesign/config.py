@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from itertools import product
 from typing import Annotated, Literal
 
@@ -96,12 +97,13 @@ class StudyConfig(StudyProblem):
         from sqlalchemy.engine import make_url
         from sqlalchemy.exc import ArgumentError
 
+        user = storage.partition("://")[2].rpartition("@")[0]
+        if ":" in user or re.search(r"pass|pwd|secret|token", storage.partition("?")[2], re.IGNORECASE):
+            raise ValueError("remove the password: the address is written to files; use ~/.pgpass or PGPASSWORD")
         try:
             url = make_url(storage)
-        except ArgumentError:
+        except (ArgumentError, ValueError):
             raise ValueError(f"allowed: {JOURNAL}, postgresql://user@host:port/database") from None
-        if url.password is not None or "password" in url.query:
-            raise ValueError("remove the password: the address is written to files; use ~/.pgpass or PGPASSWORD")
         if url.get_backend_name() != "postgresql" or not url.database:
             raise ValueError(f"allowed: {JOURNAL}, postgresql://user@host:port/database")
         return storage

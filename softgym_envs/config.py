@@ -6,7 +6,7 @@ import copy
 import functools
 import re
 import reprlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError, model_validator
 from pydantic_core import ErrorDetails
 
 from softgym_envs.errors import ConfigError, unknown_name
+from softgym_envs.registry import ALLOW_CODE, code_is_allowed, is_place
 
 
 class Config(BaseModel):
@@ -42,8 +43,34 @@ class BesideConfig:
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML with the numbers of YAML 1.2 and JSON: ``1e-3`` is a number, although PyYAML reads it as a string."""
+    """YAML with the numbers of YAML 1.2 and JSON: ``1e-3`` is a number, although PyYAML reads it as a string.
 
+    What YAML 1.1 reads otherwise than people is refused: ``024`` (octal), ``1:30`` (base 60), and a key given twice.
+    """
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen: set[str] = set()
+        for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                continue
+            if key.value in seen:
+                raise yaml.constructor.ConstructorError(None, None, f"key '{key.value}' is given twice", key.start_mark)
+            seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+    def construct_number(self, node: yaml.ScalarNode) -> int | float:
+        """Return the number of a node, unless it is read in another base than people read it."""
+        if _MISREAD.match(node.value):
+            problem = f"'{node.value}' is no decimal number; write it without leading zeros and colons, or in quotes"
+            raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark)
+        if node.tag.endswith("int"):
+            return self.construct_yaml_int(node)
+        return self.construct_yaml_float(node)
+
+
+_MISREAD = re.compile(r"[-+]?(0[0-9_]|[0-9][0-9_]*:)")
+_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_number)
+_Loader.add_constructor("tag:yaml.org,2002:float", _Loader.construct_number)
 
 _Loader.add_implicit_resolver(
     "tag:yaml.org,2002:float",
@@ -67,8 +94,14 @@ CONFIGS = Path(__file__).parent / "configs"
 ENTRIES = "configurations"
 """Key of a file with several configurations, by name; the key ``defaults`` beside it holds what they share."""
 
-_PASSWORD = re.compile(r"(?<=[^/]):[^/@:\s]*@")
-"""The password in a database address, which must not appear in a message or log."""
+_ADDRESS = re.compile(r"([A-Za-z][\w+.-]*://).*", re.DOTALL)
+"""An address, which may hold a password in many forms; none of it must appear in a message or log."""
+
+
+def masked(text: str) -> str:
+    """Return a text without what follows the scheme of an address, such as ``postgresql://``."""
+    return _ADDRESS.sub(r"\1***", text)
+
 
 _IN_YAML = (
     (re.compile(r"must be a valid (tuple|list)"), "must be a list"),
@@ -114,17 +147,18 @@ def load_config(path: str | Path | None, model: type[ModelT], overrides: Sequenc
     for override in overrides:
         key, separator, text = override.partition("=")
         if not separator or not key:
-            raise ConfigError(f"override '{override}' must look like key=value or part.key=value")
+            raise ConfigError(f"override '{masked(override)}' must look like key=value or part.key=value")
         node = data
         *parents, last = key.split(".")
         for parent in parents:
             node = node.setdefault(parent, {})
             if not isinstance(node, dict):
-                raise ConfigError(f"override '{override}': '{parent}' is a value, not a group of keys")
+                raise ConfigError(f"override '{masked(override)}': '{parent}' is a value, not a group of keys")
         try:
             node[last] = read_value(text)
-        except yaml.YAMLError:
-            raise ConfigError(f"override '{override}': the value is not valid YAML") from None
+        except (yaml.YAMLError, RecursionError) as error:
+            reason = f": {error.problem}" if isinstance(error, yaml.constructor.ConstructorError) else ""
+            raise ConfigError(f"override '{masked(override)}': the value is not valid YAML{reason}") from None
     return check_config(model, data, f"config '{path}'" if path is not None else "config")
 
 
@@ -136,6 +170,8 @@ def _read_file(path: Path) -> dict[str, Any]:
         inside = path / "config.yaml"
         reason = f"it is a folder; its file is {inside}" if inside.exists() else error.strerror or error
         raise ConfigError(f"config '{path}' cannot be read: {reason}") from None
+    except RecursionError:
+        raise ConfigError(f"config '{path}' is nested too deeply") from None
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         where = getattr(error, "problem_mark", None)
         place = f", line {where.line + 1}" if where is not None else ""
@@ -221,10 +257,39 @@ def check_config(model: type[ModelT], data: dict[str, Any], where: str) -> Model
     Raises:
         ConfigError: one line that describes the first problem.
     """
+    refuse_code(data, where)
     try:
         return model.model_validate(data)
     except ValidationError as error:
         raise ConfigError(f"{where}: {first_problem(error)}") from None
+
+
+def refuse_code(data: Any, where: str, key: str = "") -> None:
+    """Refuse plain data that names code, ``"module:name"``, which the user did not allow (`allow_code`).
+
+    Whoever uses a file would otherwise run what its author wrote.
+
+    Args:
+        data: keys and values.
+        where: source of the data, for the message.
+        key: dotted key of the data, for the message.
+
+    Raises:
+        ConfigError: one line with the key and the code.
+    """
+    if isinstance(data, Mapping):
+        for name, value in data.items():
+            refuse_code(name, where, key)
+            if name != "title":
+                refuse_code(value, where, f"{key}.{name}" if key else str(name))
+    elif isinstance(data, list | tuple):
+        for value in data:
+            refuse_code(value, where, key)
+    elif is_place(data) and not code_is_allowed(data):
+        raise ConfigError(
+            f"{where}: {key} = {data!r} names code, which using this file would run; allowed: registered names, or "
+            f"code that you trust with --allow-code (in Python {ALLOW_CODE}=1)"
+        )
 
 
 def first_problem(error: ValidationError) -> str:
@@ -251,7 +316,7 @@ def _describe(problem: ErrorDetails) -> str:
     for pattern, plain in _IN_YAML:
         message = pattern.sub(plain, message)
     value = problem["input"]
-    shown = _PASSWORD.sub(r":***@", repr(value))
+    shown = masked(repr(value))
     # A text stands in quotes, but a bound in the message may be the same number as the value.
     named = shown in message if isinstance(value, str) else f"= {shown}" in message or f"got {shown}" in message
     if not isinstance(value, dict) and not named:

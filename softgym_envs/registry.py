@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import inspect
 import numbers
+import os
+import re
 import types
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache, partial
@@ -146,7 +148,7 @@ class Registry(Table):
         if not isinstance(name_or_class, str):
             return self._checked(name_or_class)
         if ":" in name_or_class and name_or_class not in self:
-            return self._checked(import_object(self.kind, name_or_class))
+            return self._checked(import_place(self.kind, name_or_class))
         found: type = self.find(name_or_class)
         return found
 
@@ -227,6 +229,42 @@ def import_object(kind: str, path: str) -> Any:
     if not hasattr(module, name):
         raise ValueError(f"{kind} '{path}': module '{name_of_module}' has no '{name}'")
     return getattr(module, name)
+
+
+ALLOW_CODE = "SOFTGYM_ALLOW_CODE"
+"""Environment variable: places of code that files may name, separated by commas; ``1`` for all."""
+
+_PLACE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
+
+
+def is_place(text: object) -> bool:
+    """Return whether a value names code by its place, ``"module:name"``."""
+    return isinstance(text, str) and _PLACE.fullmatch(text) is not None
+
+
+def allow_code(*places: str) -> None:
+    """Let files name code at some places ``"module:name"``, also in processes started from now on; ``"1"`` for all."""
+    known = [place for place in os.environ.get(ALLOW_CODE, "").split(",") if place]
+    if places:
+        os.environ[ALLOW_CODE] = ",".join(dict.fromkeys([*known, *places]))
+
+
+def code_is_allowed(place: str) -> bool:
+    """Return whether a file may name the code at a place ``"module:name"``, see `allow_code`."""
+    return not {"1", place}.isdisjoint(os.environ.get(ALLOW_CODE, "").split(","))
+
+
+def import_place(kind: str, place: str) -> Any:
+    """Return the object at a place ``"module:name"`` that the user named; files may name it from now on.
+
+    What files name is checked where they are read (`softgym_envs.config.refuse_code`).
+
+    Raises:
+        ValueError: as `import_object`.
+    """
+    found = import_object(kind, place)
+    allow_code(place)
+    return found
 
 
 @cache  # looking up the types of a constructor takes milliseconds

@@ -63,9 +63,16 @@ class RunFolder(Generic[ModelT]):
         """
         if not self.begun:
             raise DataError(f"'{self.path}' is not the folder of {self.kind}: it has no config.yaml")
+        file = self.path / "config.yaml"
         try:
-            return load_config(self.path / "config.yaml", self.model)
-        except ConfigError as error:
+            head, _, content = file.read_text().partition("\n")
+            if head != _signature(content):
+                raise ConfigError(
+                    "its config.yaml was edited after the run began, so that its results would stand under another "
+                    "configuration; edit a copy elsewhere"
+                )
+            return load_config(file, self.model)
+        except (ConfigError, UnicodeDecodeError, OSError) as error:
             raise ConfigError(f"folder '{self.path}' does not hold {self.kind}: {error}; use another folder") from None
 
     def begin(self, config: ModelT) -> None:
@@ -75,8 +82,9 @@ class RunFolder(Generic[ModelT]):
 
     def keep(self, config: ModelT) -> None:
         """Write the configuration with which a run continues; its provenance stays."""
+        content = yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
         with atomic_write(self.path / "config.yaml", "w") as stream:
-            yaml.safe_dump(config.model_dump(mode="json"), stream, sort_keys=False)
+            stream.write(f"{_signature(content)}\n{content}")
         self.__dict__.pop("config", None)
 
     def accept(self, config: ModelT, may_change: Sequence[str] = ()) -> None:
@@ -158,6 +166,11 @@ class RunFolder(Generic[ModelT]):
     def stamp(self) -> dict[str, Any]:
         """Return the provenance of a result of this call, with all changes of the code during the run."""
         return {**provenance(), "code_changes": code_changes(self.path)}
+
+
+def _signature(content: str) -> str:
+    """Return the first line of a stored configuration, by which an edited one is noticed."""
+    return f"# SHA-256 {hashlib.sha256(content.encode()).hexdigest()}"
 
 
 def file_lock(folder: Path, name: str) -> BaseFileLock:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import tempfile
@@ -73,6 +74,8 @@ def read_json(path: str | Path) -> Any:
     """
     try:
         return json.loads(Path(path).read_text())
+    except RecursionError:
+        raise DataError(f"'{path}' cannot be read: it is nested too deeply") from None
     except json.JSONDecodeError as error:
         raise DataError(f"'{path}' cannot be read: it is truncated or not valid JSON ({error})") from None
     except (OSError, ValueError) as error:
@@ -84,6 +87,11 @@ def write_json(path: str | Path, value: object) -> None:
     with atomic_write(path, "w") as stream:
         json.dump(value, stream, indent=2)
         stream.write("\n")
+
+
+def hash_of(path: str | Path) -> str:
+    """Return the SHA-256 of a file in hexadecimal digits."""
+    return hashlib.sha256(Path(path).read_bytes()).hexdigest()
 
 
 def drop_torn_line(path: str | Path) -> None:
@@ -123,7 +131,7 @@ class JsonLines:
         for number, line in enumerate(self.path.read_bytes().splitlines(), start=1):
             try:
                 record = json.loads(line)
-            except ValueError:
+            except (ValueError, RecursionError):
                 record = None
             if not isinstance(record, dict):
                 raise DataError(f"'{self.path}', line {number} is damaged; remove the line to compute its record again")

@@ -347,11 +347,11 @@ def train_small_surrogate(
     from softgym_envs.surrogate.features import Features
     from softgym_envs.surrogate.trainer import Trainer
     from softgym_envs.surrogate.training import domain_of
-    from softgym_envs.surrogate.weight_files import card_of, save_model
+    from softgym_envs.surrogate.weight_files import new_card, save_model
 
     training = sample_states(robot, states, 0, limit=limit, sequence="halton")
     validation = sample_states(robot, max(states // 3, 20), 1, limit=limit)
-    card = card_of(robot, "potential")
+    card = new_card(robot, "potential")
     features = Features(robot)
     options = potential.Options(width=width, body_width=width // 2, members=members, steps=steps, batch_size=128)
     tensors, _ = potential.train(

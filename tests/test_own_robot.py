@@ -43,7 +43,17 @@ def folder(tmp_path, monkeypatch):
 def codesign(folder):
     """Run the study by the command line in ``folder``, as a user does."""
     (folder / "study.yaml").write_text(yaml.safe_dump(STUDY))
-    command = [sys.executable, "-m", "softgym_envs.cli", "codesign", "--config", "study.yaml", "--folder", "study"]
+    command = [
+        sys.executable,
+        "-m",
+        "softgym_envs.cli",
+        "codesign",
+        "--config",
+        "study.yaml",
+        "--folder",
+        "study",
+        "--allow-code",
+    ]
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
 
 

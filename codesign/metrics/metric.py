@@ -16,7 +16,7 @@ import numpy as np
 
 from softgym_envs.codesign.metrics.sources import EPISODES, SOURCES, Source
 from softgym_envs.errors import unknown_name
-from softgym_envs.registry import Table, import_object
+from softgym_envs.registry import Table, import_place
 from softgym_envs.units import Display, display, effort_unit
 from softgym_envs.wording import decimal
 
@@ -231,7 +231,7 @@ def find_metric(name: str | Metric, robot: Robot | None = None, task: type[Task]
     elif name in METRICS:
         found = METRICS[name]
     elif ":" in name:
-        found = import_object("metric", name)
+        found = import_place("metric", name)
         if not isinstance(found, Metric):
             if not callable(found):
                 raise ValueError(f"metric '{name}' must be a Metric or a function, got {type(found).__name__}")

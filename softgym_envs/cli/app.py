@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 from typing import NoReturn
 
@@ -11,8 +12,11 @@ import click
 from softgym_envs.cli.options import Resumable, Verbs
 from softgym_envs.errors import SoftGymError
 from softgym_envs.extras import explain
-from softgym_envs.registry import Table
+from softgym_envs.registry import Table, allow_code, is_place
 from softgym_envs.version import __version__
+
+ALLOW = "--allow-code"
+"""Flag of all verbs: files may name code, and the current folder is on the search path."""
 
 SECTIONS = {
     "Environments": {
@@ -86,7 +90,11 @@ class _Verbs(Verbs):
 @click.version_option(__version__, prog_name="softgym")
 @click.pass_context
 def cli(ctx: click.Context) -> None:
-    """Optimise the body and the controller of a soft robot together."""
+    """Optimise the body and the controller of a soft robot together.
+
+    Files name robots, tasks, metrics, ... that are registered. With --allow-code, in any place, they may also name
+    code of yours as module:name, which is looked up in the current folder too.
+    """
     if ctx.invoked_subcommand is None:
         click.echo(ctx.get_help())
 
@@ -101,11 +109,15 @@ def main() -> None:
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
     threadpool_limits(1)
-    # Robots, tasks and objectives of your own ("my_module:MyRobot") may be in the current folder. At the end of the
-    # search path, files in it cannot replace modules of the suite.
-    sys.path.append(os.getcwd())
+    arguments = [argument for argument in sys.argv[1:] if argument != ALLOW]
+    named = [word for argument in arguments for word in re.split(r"[=,\[\]{}\s]+", argument) if is_place(word)]
+    allow_code(*named, *(["1"] if ALLOW in sys.argv else []))
+    if named or ALLOW in sys.argv:
+        # Robots, tasks and metrics of your own ("my_module:MyRobot") may be in the current folder. At the end of the
+        # search path, files in it cannot replace modules of the suite.
+        sys.path.append(os.getcwd())
     try:
-        cli(prog_name="softgym", standalone_mode=False)
+        cli(arguments, prog_name="softgym", standalone_mode=False)
     except click.exceptions.Exit as leave:
         sys.exit(leave.exit_code)
     except (click.Abort, KeyboardInterrupt) as stop:

@@ -185,4 +185,4 @@ def view(recording: Path) -> None:
     require("viewer")
     if not any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")):
         raise ConfigError(f"there is no display to open '{recording}' on; copy the file to a machine that has one")
-    sys.exit(subprocess.call([sys.executable, "-m", "rerun", str(recording)]))
+    sys.exit(subprocess.call([sys.executable, "-m", "rerun", "--bind", "127.0.0.1", str(recording)]))

@@ -53,7 +53,7 @@ def fit(config: Path, folder: Path, data: Path | None, quiet: bool, overrides: t
 @click.command("calibrate-trust")
 @click.argument("robot", shell_complete=options.complete_robot)
 @options.robot_option
-@click.option("--weights", type=options.PATH, help="Folder of the weights (default: the shipped weights).")
+@click.option("--weights", type=options.PATH, required=True, help="Folder of the weights, whose card is written.")
 @click.option("--folder", type=options.PATH, help="Keep the FEM states in this folder; an interrupted run continues.")
 @click.option(
     "--bodies", type=click.IntRange(1), default=64, show_default=True, help="Number of bodies in each stratum."
@@ -72,7 +72,7 @@ def fit(config: Path, folder: Path, data: Path | None, quiet: bool, overrides: t
 def calibrate_trust(
     robot: str,
     options_: tuple[str, ...],
-    weights: Path | None,
+    weights: Path,
     folder: Path | None,
     bodies: int,
     states: int,
@@ -90,12 +90,11 @@ def calibrate_trust(
     from dataclasses import asdict
 
     from softgym_envs.surrogate.calibration import calibrate
-    from softgym_envs.surrogate.pretrained import pretrained_folder
 
     body = options.robot_of(robot, options_)
     with nullcontext() if folder is None else options.resumable():
         found = calibrate(
-            weights or pretrained_folder(body), body, bodies=bodies, states=states,
+            weights, body, bodies=bodies, states=states,
             adversarial_states=adversarial_states, seed=seed, state_folder=folder, kept_only=kept_only, workers=workers,
         )  # fmt: skip
     click.echo(json.dumps({name: asdict(row) for name, row in found.items()}, indent=2))
@@ -104,13 +103,13 @@ def calibrate_trust(
 @click.command("fit-inertia")
 @click.argument("robot", shell_complete=options.complete_robot)
 @options.robot_option
-@click.option("--weights", type=options.PATH, help="Folder of the weights (default: the shipped weights).")
+@click.option("--weights", type=options.PATH, required=True, help="Folder of the weights; the inertia goes there too.")
 @click.option("--bodies", type=click.IntRange(8), default=128, show_default=True, help="Number of bodies.")
 @click.option("--states", type=click.IntRange(1), default=4, show_default=True, help="Number of commands per body.")
 @click.option("--degree", type=click.IntRange(1), default=3, show_default=True, help="Degree of the polynomials.")
 @click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Number of processes.")
 def fit_inertia(
-    robot: str, options_: tuple[str, ...], weights: Path | None, bodies: int, states: int, degree: int, workers: int
+    robot: str, options_: tuple[str, ...], weights: Path, bodies: int, states: int, degree: int, workers: int
 ) -> None:
     """Learn the inertia of a robot, for motion on its surrogate.
 
@@ -119,10 +118,9 @@ def fit_inertia(
     """
     from softgym_envs.surrogate.inertia import write_inertia
     from softgym_envs.surrogate.inertia_training import fit_inertia as run
-    from softgym_envs.surrogate.pretrained import pretrained_folder
 
     body = options.robot_of(robot, options_)
     found = run(body, bodies=bodies, states=states, degree=degree, workers=workers, progress=True)
-    write_inertia(found, weights or pretrained_folder(body))
+    write_inertia(found, weights)
     names = ("bodies", "states", "tested_bodies", "mean_frequency_error", "largest_frequency_error")
     click.echo(json.dumps({name: found.card[name] for name in names}, indent=2))

@@ -10,6 +10,7 @@ diagonal, are polynomials of the design and of the reached displacements, so ``P
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Mapping
 from itertools import combinations_with_replacement
@@ -143,9 +144,14 @@ def write_inertia(inertia: LearnedInertia, folder: str | Path) -> None:
     """Write a learned inertia beside the weights of a model, with the provenance of this run."""
     from safetensors.numpy import save
 
-    card = {**inertia.card, "degree": inertia.degree, "provenance": provenance()}
+    values = inertia.coefficients.astype(np.float32)
+    card = {**inertia.card, "degree": inertia.degree, "sha256": _hash(values), "provenance": provenance()}
     with atomic_write(Path(folder) / FILE) as stream:
-        stream.write(save({"coefficients": inertia.coefficients.astype(np.float32)}, {"card": json.dumps(card)}))
+        stream.write(save({"coefficients": values}, {"card": json.dumps(card)}))
+
+
+def _hash(values: np.ndarray) -> str:
+    return hashlib.sha256(np.ascontiguousarray(values).tobytes()).hexdigest()
 
 
 def read_inertia(folder: str | Path, robot: Robot) -> LearnedInertia:
@@ -169,6 +175,8 @@ def read_inertia(folder: str | Path, robot: Robot) -> LearnedInertia:
             coefficients = file.get_tensor("coefficients")
         if not np.isfinite(coefficients).all():
             raise ValueError("values are not finite")
+        if card.get("sha256") != _hash(coefficients):
+            raise ValueError("values are not those of its card (SHA-256)")
         if card["robot"] != robot.name or card["mechanics_key"] != robot.mechanics_key:
             raise WeightsError(
                 f"inertia '{path}' was learned for another robot: {card['robot']} {card['mechanics_key']}, needed "
@@ -176,5 +184,5 @@ def read_inertia(folder: str | Path, robot: Robot) -> LearnedInertia:
             )
         check_box(path.name, card["design_variables"], card_of(robot, "inertia")["design_variables"])
         return LearnedInertia(robot, coefficients, int(card["degree"]), card)
-    except (SafetensorError, OSError, ValueError, KeyError, TypeError) as error:
+    except (SafetensorError, OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise WeightsError(f"inertia '{path}' is damaged: {error}") from None

@@ -16,6 +16,7 @@ from typing import Any
 from softgym_envs.errors import WeightsError
 from softgym_envs.robots.base import CONTACT_DEFAULTS, Robot
 from softgym_envs.robots.registry import ROBOTS
+from softgym_envs.surrogate.identity import class_of
 from softgym_envs.surrogate.model import SurrogateModel
 from softgym_envs.surrogate.weight_files import load_model
 
@@ -45,8 +46,17 @@ def ships_weights(robot: Robot) -> bool:
 
     A robot may touch itself without friction if its weights were trained so. Obstacles are never part of them.
     """
+    key = robot.mechanics_key
+    return _ships_for_class(robot) and _contact_of(_card(pretrained_folder(robot))["mechanics_key"]) == _contact_of(key)
+
+
+def _ships_for_class(robot: Robot) -> bool:
+    """Return whether weights ship for the very class of a robot: a subclass may be another body under the same name."""
     folder = pretrained_folder(robot)
-    return folder.is_dir() and _contact_of(_card(folder)["mechanics_key"]) == _contact_of(robot.mechanics_key)
+    if not folder.is_dir():
+        return False
+    card = _card(folder)
+    return card["robot"] == robot.name and card.get("class", card["robot"]) == class_of(robot)
 
 
 def _card(folder: Path) -> dict[str, Any]:
@@ -71,7 +81,7 @@ def pretrained_model(robot: Robot, weights: str | Path | None = None, members: i
     Raises:
         WeightsError: if there are no weights, or they are damaged or for another robot.
     """
-    if weights is None and pretrained_folder(robot).is_dir() and not ships_weights(robot):
+    if weights is None and _ships_for_class(robot) and not ships_weights(robot):
         known = _contact_of(_card(pretrained_folder(robot))["mechanics_key"])
         raise WeightsError(
             f"the shipped weights of '{robot.weights_name}' know {'self_contact' if known else 'no contact'}"

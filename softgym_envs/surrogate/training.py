@@ -30,7 +30,7 @@ from softgym_envs.surrogate.model import SurrogateModel, definite
 from softgym_envs.surrogate.networks import NETWORKS, network_module
 from softgym_envs.surrogate.row_errors import RowErrors
 from softgym_envs.surrogate.trainer import Trainer
-from softgym_envs.surrogate.weight_files import card_of, load_model, save_model
+from softgym_envs.surrogate.weight_files import load_model, new_card, save_model
 
 SPLITS = ("train", "validation", "test")
 
@@ -373,7 +373,7 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
     parts = [learned[name] for name in ("train", "pretraining/train") if name in learned]
     every = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     card = {
-        **card_of(robot, config.network.kind),
+        **new_card(robot, config.network.kind),
         "config": config.model_dump(mode="json", exclude={"executor"}),
         "domain": domain_of(model, every, data["validation"]),
         "loaded": bool(robot.build().loads.any() or robot.load_variables),

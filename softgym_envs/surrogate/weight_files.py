@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from softgym_envs.errors import WeightsError
+from softgym_envs.errors import DataError, WeightsError
 from softgym_envs.robots.base import Robot
 from softgym_envs.runs import provenance
-from softgym_envs.storage import atomic_write, write_json
+from softgym_envs.storage import atomic_write, hash_of, read_json, write_json
+from softgym_envs.surrogate.identity import class_of, difference, fingerprint, is_shipped
 from softgym_envs.surrogate.model import SurrogateModel
 from softgym_envs.surrogate.networks import network_module
 
@@ -25,10 +25,17 @@ def card_of(robot: Robot, network: str) -> dict[str, Any]:
         "format": FORMAT,
         "network": network,
         "robot": robot.name,
+        "class": class_of(robot),
         "mechanics_key": robot.mechanics_key,
         "design_variables": {n: [v.low, v.high, v.unit] for n, v in robot.design_space.variables.items()},
         "actuators": [[actuator.low, actuator.high] for actuator in robot.actuators],
     }
+
+
+def new_card(robot: Robot, network: str) -> dict[str, Any]:
+    """Return `card_of` for weights of a robot as it is now, with the fingerprint of one that is not of the suite."""
+    card = card_of(robot, network)
+    return card if is_shipped(robot) else {**card, "fingerprint": fingerprint(robot)}
 
 
 def read_weights(folder: str | Path, robot: Robot) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
@@ -49,9 +56,9 @@ def read_weights(folder: str | Path, robot: Robot) -> tuple[dict[str, Any], dict
         if not path.is_file():
             raise WeightsError(f"weights file '{path}' does not exist; train it with 'softgym fit'")
     try:
-        card = json.loads(card_path.read_text())
-    except ValueError as error:
-        raise WeightsError(f"weights card '{card_path}' is not valid JSON: {error}") from None
+        card = read_json(card_path)
+    except DataError as error:
+        raise WeightsError(f"weights card {error}") from None
     if not isinstance(card, dict) or card.get("format") != FORMAT:
         raise WeightsError(f"weights card '{card_path}' does not have format {FORMAT}")
     if card.get("robot") != robot.name or card.get("mechanics_key") != robot.mechanics_key:
@@ -64,12 +71,23 @@ def read_weights(folder: str | Path, robot: Robot) -> tuple[dict[str, Any], dict
             + ", ".join(f"{k} = {found.get(k)!r}, needed {wanted.get(k)!r}" for k in different)
             + "; use backend='fem' or train weights with 'softgym fit'"
         )
+    if card.get("class", card.get("robot")) != class_of(robot):
+        raise WeightsError(
+            f"weights '{folder.name}' were trained for the class {card.get('class', card.get('robot'))}, needed "
+            f"{class_of(robot)}; use backend='fem' or train weights with 'softgym fit'"
+        )
+    if not is_shipped(robot) and (other := difference(card.get("fingerprint"), fingerprint(robot))):
+        raise WeightsError(
+            f"weights '{folder.name}' were trained for other bodies of robot '{robot.name}': {other}; was its code "
+            "or a file changed? Use backend='fem' or train weights with 'softgym fit'"
+        )
     expected = card_of(robot, str(card.get("network")))
     if card.get("actuators") != expected["actuators"]:
         raise WeightsError(
             f"weights '{folder.name}' have actuators = {card.get('actuators')}, needed {expected['actuators']}"
         )
     check_box(folder.name, card.get("design_variables"), expected["design_variables"])
+    check_hash(weights_path, card)
     try:
         tensors = load_file(weights_path)
     except (SafetensorError, OSError, ValueError) as error:
@@ -77,6 +95,19 @@ def read_weights(folder: str | Path, robot: Robot) -> tuple[dict[str, Any], dict
     if wrong := sorted(name for name, tensor in tensors.items() if not np.isfinite(tensor).all()):
         raise WeightsError(f"weights '{weights_path}' have values that are not finite in {', '.join(wrong)}")
     return card, tensors
+
+
+def check_hash(path: Path, card: Mapping[str, Any]) -> None:
+    """Check that a file of weights is the one that its card describes, by the entry ``sha256``.
+
+    Raises:
+        WeightsError: if it is another one, or the card does not say.
+    """
+    if card.get("sha256") != (found := hash_of(path)):
+        raise WeightsError(
+            f"weights '{path}' are damaged, or not those of the card beside them: their SHA-256 begins with "
+            f"{found[:12]}, that of the card with {str(card.get('sha256'))[:12]}"
+        )
 
 
 def check_box(weights: str, learned: Any, needed: dict[str, list]) -> None:
@@ -134,4 +165,5 @@ def write_weights(tensors: Mapping[str, np.ndarray], card: Mapping[str, Any], fo
     weights = {name: np.array(value, dtype=np.float32, order="C") for name, value in tensors.items()}
     with atomic_write(folder / "model.safetensors") as stream:
         stream.write(save(weights))
-    write_json(folder / "model.json", {**card, "provenance": provenance()})
+    digest = hash_of(folder / "model.safetensors")
+    write_json(folder / "model.json", {**card, "sha256": digest, "provenance": provenance()})

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import html
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -187,8 +189,8 @@ def leaderboard(folder: Path = SUBMISSIONS, data: Path = DATA, more: Sequence[Pa
                 -(score or 0.0),
                 [
                     f"`{submission.problem}`",
-                    submission.method,
-                    submission.author or "-",
+                    _escaped(submission.method),
+                    _escaped(submission.author) or "-",
                     submission.level,
                     "-" if score is None else f"{score:.3f}",
                     ", ".join(f"{value:.4g}" for value in submission.claimed[0]),
@@ -302,3 +304,9 @@ def _tau(found: Agreement) -> str:
 def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     lines = ["| " + " | ".join(header) + " |", "| " + " | ".join("---" for _ in header) + " |"]
     return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
+
+
+def _escaped(text: str) -> str:
+    """Return what a stranger wrote as one cell of a table, without markup of HTML or Markdown."""
+    plain = html.escape(" ".join(text.split()), quote=True)
+    return re.sub(r"([\\`*_\[\]()!|#~])", lambda found: f"&#{ord(found[1])};", plain)

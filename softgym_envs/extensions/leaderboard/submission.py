@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from functools import cache
-from math import isfinite
+from math import inf, isfinite
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
@@ -130,9 +130,37 @@ class Submission(Record):
             DataError: if a field is missing, unknown or of another type, also in a row of the ledger.
         """
         found = _typed(cls, data, "the submission")
+        _check_numbers(found)
         for number, row in enumerate(found.ledger):
-            _typed(Score, row, f"ledger.{number}")
+            _check_score(_typed(Score, row, f"ledger.{number}"), f"ledger.{number}")
         return found
+
+
+def _check_numbers(found: Submission) -> None:
+    """Raise DataError for numbers that no search has."""
+    for name, most in (("seed", 2**32 - 1), ("optimiser_seconds", inf), ("pretraining_steps", inf)):
+        if not 0 <= getattr(found, name) <= most or not isfinite(getattr(found, name)):
+            raise DataError(f"the submission: {name} = {getattr(found, name)!r}; allowed: finite numbers from 0")
+    for name, numbers in (
+        ("designs", [value for design in found.designs for value in design.values()]),
+        ("claimed", [value for scores in found.claimed for value in scores]),
+    ):
+        if not all(map(isfinite, numbers)):
+            raise DataError(f"the submission: {name} holds numbers that are not finite")
+
+
+def _check_score(row: Score, where: str) -> None:
+    """Raise DataError for a row of a ledger that no search writes."""
+    for name, numbers in (("design", row.design.values()), ("values", row.values.values()), ("scores", row.scores)):
+        if not all(map(isfinite, numbers)):
+            raise DataError(f"{where}.{name} holds numbers that are not finite")
+    for name in Budget.model_fields:
+        if not (isfinite(value := getattr(row, name)) and value >= 0):
+            raise DataError(f"{where}.{name} = {value:g}; allowed: finite numbers from 0")
+    if not 0.0 < row.share <= 1.0:
+        raise DataError(f"{where}.share = {row.share:g}; allowed: above 0, up to 1")
+    if row.feasible != bool(row.scores):
+        raise DataError(f"{where} has {'no scores' if row.feasible else 'a reason and scores'}; allowed: one of both")
 
 
 def _trained_on(policy: Policy) -> set[str]:

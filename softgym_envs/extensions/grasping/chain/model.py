@@ -16,7 +16,7 @@ from softgym_envs.extensions.grasping.chain.equilibrium import advance, condense
 from softgym_envs.extensions.grasping.chain.segments import segment_stiffness
 from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.domain import OUTSIDE, SPREAD
-from softgym_envs.surrogate.weight_files import card_of, read_weights, write_weights
+from softgym_envs.surrogate.weight_files import new_card, read_weights, write_weights
 
 NETWORK = "chain"
 WEIGHTS = Path(__file__).parent / "weights"
@@ -233,7 +233,7 @@ def carried_points(q: np.ndarray, nodes: np.ndarray, arms: np.ndarray) -> np.nda
 
 def save_chain(model: ChainModel, folder: str | Path) -> None:
     """Write the weights of a chain and its card, for `load_chain`."""
-    write_weights(model.tensors, {**card_of(model.robot, NETWORK), **model.card}, folder)
+    write_weights(model.tensors, {**new_card(model.robot, NETWORK), **model.card}, folder)
 
 
 def load_chain(robot: Robot, folder: str | Path | None = None) -> ChainModel:
