@@ -12,6 +12,7 @@ from softgym_envs import make_robot
 from softgym_envs.config import load_config, shipped_configs
 from softgym_envs.errors import DataError, WeightsError
 from softgym_envs.extensions.networks import residual
+from softgym_envs.storage import hash_of
 from softgym_envs.surrogate import online
 from softgym_envs.surrogate.correction import fit_correction
 from softgym_envs.surrogate.data.dataset import load_dataset
@@ -416,6 +417,8 @@ def test_weights_that_are_not_finite(copied):
     tensors["effector"] = tensors["effector"].copy()
     tensors["effector"].flat[3] = np.nan
     save_file(tensors, folder / "model.safetensors")
+    card = json.loads((folder / "model.json").read_text())
+    (folder / "model.json").write_text(json.dumps({**card, "sha256": hash_of(folder / "model.safetensors")}))
     with pytest.raises(WeightsError, match="not finite in effector"):
         load_model(folder, robot)
 
