@@ -41,6 +41,11 @@ def distributions(config: StudyProblem) -> dict[str, optuna.distributions.BaseDi
     }
 
 
+def trial_id(storage: optuna.storages.BaseStorage, study: optuna.Study, number: int) -> int:
+    """Return the ID by which a storage knows a trial of a study."""
+    return storage.get_trial_id_from_study_id_trial_number(storage.get_study_id_from_name(study.study_name), number)
+
+
 def open_study(folder: StudyFolder, storage: StudyStorage | None = None, number: int = 0) -> optuna.Study:
     """Open the Optuna study of a folder, with a sampler that proposes the trial ``number``.
 

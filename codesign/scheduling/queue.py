@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from softgym_envs.codesign.folder import StudyFolder
 from softgym_envs.codesign.records import TrialResult
 from softgym_envs.codesign.sampling import trial_seed
-from softgym_envs.codesign.scheduling.optuna_study import distributions, open_study
+from softgym_envs.codesign.scheduling.optuna_study import distributions, open_study, trial_id
 
 if TYPE_CHECKING:
     import optuna
@@ -179,7 +179,7 @@ class TrialQueue:
         for taken in study.get_trials(deepcopy=False, states=(TrialState.RUNNING,)):
             if taken.user_attrs.get("worker") == self.worker and taken.number not in self._claimed:
                 # Claimed, but the answer got lost.
-                return optuna.Trial(study, taken._trial_id)
+                return optuna.Trial(study, trial_id(self.storage.optuna, study, taken.number))
         if not self._claimable(study):
             return None
         number = len(study.get_trials(deepcopy=False))
@@ -215,8 +215,9 @@ class TrialQueue:
             attributes["reason"] = result.reason
         if self.storage.shared:
             attributes["result"] = result.to_json()
+        known = trial_id(self.storage.optuna, study, trial.number)
         for key, value in attributes.items():
-            self.storage.optuna.set_trial_user_attr(trial._trial_id, key, value)
+            self.storage.optuna.set_trial_user_attr(known, key, value)
         if result.state == "complete":
             study.tell(trial.number, result.scores)
         else:

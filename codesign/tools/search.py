@@ -12,6 +12,7 @@ import numpy as np
 
 from softgym_envs.codesign.sampling import make_sampler
 from softgym_envs.codesign.scheduling.journal import open_journal
+from softgym_envs.codesign.scheduling.optuna_study import trial_id
 from softgym_envs.codesign.tools.config import OptimiseConfig, SearchConfig
 from softgym_envs.codesign.tools.evaluation import Evaluation, evaluate_each
 from softgym_envs.codesign.tools.plots import draw_front
@@ -68,9 +69,10 @@ class _Search:
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         self.config, self.solver = config, config.solver
         self.box = config.bodies.box()
+        self._storage = open_journal(folder / "journal.log")
         self._study = optuna.create_study(
             study_name="search",
-            storage=open_journal(folder / "journal.log"),
+            storage=self._storage,
             load_if_exists=True,
             directions=["minimize"] * len(config.objectives),
             sampler=make_sampler(self.solver.sampler, 0),
@@ -87,7 +89,8 @@ class _Search:
         proposed = self._study.user_attrs.get("proposed", 0)
         for trial in self._study.get_trials(deepcopy=False)[proposed:]:
             if not trial.state.is_finished():
-                self._study._storage.set_trial_state_values(trial._trial_id, optuna.trial.TrialState.FAIL)
+                known = trial_id(self._storage, self._study, trial.number)
+                self._storage.set_trial_state_values(known, optuna.trial.TrialState.FAIL)
 
     def trials(self) -> list[optuna.trial.FrozenTrial]:
         """Return all trials except those of discarded batches."""
@@ -147,7 +150,8 @@ class _Search:
     def _tell(self, trial: optuna.trial.FrozenTrial | optuna.Trial, evaluation: Evaluation) -> None:
         import optuna
 
-        self._study._storage.set_trial_user_attr(trial._trial_id, "evaluation", evaluation.to_json())
+        known = trial_id(self._storage, self._study, trial.number)
+        self._storage.set_trial_user_attr(known, "evaluation", evaluation.to_json())
         if evaluation.feasible:
             objectives = self.config.objectives
             self._study.tell(trial.number, [float(o.cost(evaluation.metrics[o.find().name])) for o in objectives])
