@@ -5,15 +5,17 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from softgym_envs.designs import Design
 from softgym_envs.mechanics.condensation import CondensedModel
-from softgym_envs.mechanics.contact.contact import Contacts
-from softgym_envs.mechanics.solvers.dynamics import Motion
 from softgym_envs.robots.base import Robot
+
+if TYPE_CHECKING:
+    from softgym_envs.mechanics.contact.contact import Contacts
+    from softgym_envs.mechanics.solvers.dynamics import Motion
 
 #: A displacement this many times as large as the bounds of its actuator is taken for a mistake in its unit.
 FAR_BEYOND = 10.0

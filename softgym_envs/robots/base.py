@@ -8,17 +8,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import PurePath
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from softgym_envs.designs import Design, DesignSpace
 from softgym_envs.errors import InfeasibleDesign, SoftGymError
-from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
-from softgym_envs.mechanics.contact.contact import ContactSettings
-from softgym_envs.mechanics.contact.obstacles import Obstacle, obstacle_from
 from softgym_envs.mechanics.materials import resolve_material
-from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.actuator import Actuator as Actuator
 from softgym_envs.robots.checks import (
     CONTACT_DEFAULTS,
@@ -32,6 +28,10 @@ from softgym_envs.robots.geometry.meshing import BodyMesh
 from softgym_envs.robots.geometry.morphing import Feature, Morpher
 from softgym_envs.robots.geometry.symmetry import Symmetry
 from softgym_envs.robots.mesh_tiers import FOLLOWING, UNIFORM, MeshTier, choose_mesh
+
+if TYPE_CHECKING:
+    from softgym_envs.mechanics.contact.obstacles import Obstacle
+    from softgym_envs.mechanics.model import MechanicalModel
 
 F = TypeVar("F", bound=Callable[..., None])
 
@@ -162,7 +162,7 @@ class Robot(ABC):
         self,
         *,
         gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        obstacles: Sequence[Obstacle | Mapping[str, Any]] = (),
+        obstacles: Sequence[Any] = (),
         self_contact: bool = False,
         self_friction: float = 0.0,
         contact_distance: float = 5e-4,
@@ -171,10 +171,8 @@ class Robot(ABC):
     ) -> None:
         if len(gravity) != 3 or not np.isfinite(gravity).all():
             raise ValueError(f"gravity must be three finite numbers [m/s2], got {gravity!r}")
-        if isinstance(obstacles, Mapping | Obstacle):
-            raise ValueError(f"robot '{self.name}': obstacles must be a list, got one obstacle: {obstacles!r}")
         self.gravity = gravity
-        self.obstacles = tuple(obstacle_from(obstacle) for obstacle in obstacles)
+        self.obstacles = self._checked_obstacles(obstacles) if obstacles else ()
         self.self_contact = self_contact
         self.self_friction = self_friction
         self.contact_distance = contact_distance
@@ -273,7 +271,16 @@ class Robot(ABC):
         """Return the robot whose solid parts are this one's body; it takes the same designs."""
         return self
 
+    def _checked_obstacles(self, obstacles: Any) -> tuple[Any, ...]:
+        from softgym_envs.mechanics.contact.obstacles import Obstacle, obstacle_from
+
+        if isinstance(obstacles, Mapping | Obstacle):
+            raise ValueError(f"robot '{self.name}': obstacles must be a list, got one obstacle: {obstacles!r}")
+        return tuple(obstacle_from(obstacle) for obstacle in obstacles)
+
     def _add_contact(self, model: MechanicalModel, design: Mapping[str, float]) -> None:
+        from softgym_envs.mechanics.contact.contact import ContactSettings
+
         obstacles = (*self.own_obstacles(model, design), *self.obstacles)
         if not obstacles and not self.self_contact:
             return
@@ -384,7 +391,7 @@ def _json_value(value: Any, label: str) -> Any:
         return {str(key): _json_value(item, label) for key, item in value.items()}
     if isinstance(value, PurePath):
         return str(value)
-    if isinstance(value, Obstacle):
+    if hasattr(value, "as_dict"):  # an obstacle
         return _json_value(value.as_dict(), label)
     if isinstance(value, Robot):
         return {"robot": value.name, **value.mechanics_key}
@@ -515,6 +522,8 @@ class MeshedRobot(Robot):
             fixed: clamped nodes of the mesh, boolean, shape (n,).
             density: [kg/m3]; the default is that of silicone.
         """
+        from softgym_envs.mechanics.model import MechanicalModel
+
         return MechanicalModel.from_mesh(
             mesh.nodes,
             mesh.tetrahedra,
@@ -545,4 +554,6 @@ class MeshedRobot(Robot):
         if mesh.origin != "morphed" or self._morpher is None:
             return None
         base = self.mirror(self._morpher.mesh)
+        from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
+
         return EmbeddedPoints(point, base.nodes, base.tetrahedra).elements

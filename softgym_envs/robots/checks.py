@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from weakref import WeakSet
 
 import numpy as np
 
 from softgym_envs.designs import Design
 from softgym_envs.errors import unknown_name
-from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.solids import check_modulus, check_size
 from softgym_envs.quantities import check_by_unit, check_quantity
+
+if TYPE_CHECKING:
+    from softgym_envs.mechanics.model import MechanicalModel
 
 Robot = Any
 """`softgym_envs.robots.base.Robot`, which imports this module."""
@@ -216,6 +217,9 @@ def check_built(robot: Robot, model: Any, design: Mapping[str, float]) -> None:
             effector far from `Robot.effector_rest`, another gravity than the robot's, or a number that is probably in
             another unit.
     """
+    from softgym_envs.mechanics.model import MechanicalModel
+    from softgym_envs.mechanics.solids import check_modulus, check_size
+
     owner = f"robot '{robot.name}'"
     if not isinstance(model, MechanicalModel):
         raise ValueError(f"{owner}: assemble must return a MechanicalModel, got {model!r}")

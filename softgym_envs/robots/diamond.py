@@ -7,17 +7,19 @@ cable pulls each elbow inwards, which lifts the top and tilts it away.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from softgym_envs.designs import DesignSpace, DesignVariable
-from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Actuator, MeshedRobot
 from softgym_envs.robots.geometry.meshing import BodyMesh, mesh_geometry
 from softgym_envs.robots.geometry.morphing import Feature, Plane
 from softgym_envs.robots.geometry.symmetry import mirrored, square_symmetries
 from softgym_envs.robots.mesh_tiers import MeshTier
+
+if TYPE_CHECKING:
+    from softgym_envs.mechanics.model import MechanicalModel
 
 # Contours of one leg (r, z) from the base to the top [mm], inset by a few tenths to match the published volume.
 OUTER = (

@@ -15,7 +15,6 @@ from typing import Any, TypeVar
 import numpy as np
 
 from softgym_envs.errors import unknown_name
-from softgym_envs.mechanics.solids import SOLIDS
 
 T = TypeVar("T")
 
@@ -79,8 +78,11 @@ class MeshTier:
                     f"robot '{robot}': {name} = {length:g} m is larger than the robot, whose size is {largest:g} m; "
                     "did you mean metres?"
                 )
-        if element not in SOLIDS:
-            raise ValueError(unknown_name("element", element, SOLIDS))
+        if element != self.element:
+            from softgym_envs.mechanics.solids import SOLIDS
+
+            if element not in SOLIDS:
+                raise ValueError(unknown_name("element", element, SOLIDS))
         feature, guide = (None if s is None else s * size / self.size for s in (self.feature_size, self.guide_size))
         return replace(
             self,

@@ -8,13 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from softgym_envs.designs import Design, DesignSpace, DesignVariable
-from softgym_envs.mechanics.constraints.point import Point
-from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Actuator, Drawing, MeshedRobot
 from softgym_envs.robots.geometry.finger_shape import check_finger, draw_finger, in_flange
 from softgym_envs.robots.geometry.graded_finger import (
@@ -28,6 +26,9 @@ from softgym_envs.robots.geometry.meshing import BodyMesh
 from softgym_envs.robots.geometry.morphing import Feature
 from softgym_envs.robots.geometry.symmetry import left_right
 from softgym_envs.robots.mesh_tiers import MeshTier
+
+if TYPE_CHECKING:
+    from softgym_envs.mechanics.model import MechanicalModel
 
 BELLOWS = {
     "outer_radius": 14.75,
@@ -242,6 +243,8 @@ class SoftFinger(MeshedRobot):
         hint = self.reference_element(mesh, self.tip(self.reference_design))
         model.add_effector("tip", self.tip(design), hint=hint, radius=TIP_RADIUS if self.guide_radius else 0.0)
         if self.contacts:
+            from softgym_envs.mechanics.constraints.point import Point
+
             reference = self.contact_points(self.reference_design)
             for i, point in enumerate(self.contact_points(design)):
                 embedding = model.embed(point, self.reference_element(mesh, reference[i]), radius=self.guide_radius)

@@ -13,14 +13,16 @@ bounds of those of the body, with inner modes closer ones.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.linalg import block_diag
 
 from softgym_envs.errors import ConvergenceError
-from softgym_envs.mechanics.assembly import MassAndDamping
-from softgym_envs.mechanics.solvers.schemes import StartingAcceleration
-from softgym_envs.mechanics.solvers.statics import Statics
+
+if TYPE_CHECKING:
+    from softgym_envs.mechanics.assembly import MassAndDamping
+    from softgym_envs.mechanics.solvers.statics import Statics
 
 DEPENDENT = 1e-10
 """Eigenvalue of the scaled compliance below which constraint values count as dependent."""
@@ -100,6 +102,8 @@ def reduce_motion(
     mass, stiffness = 0.5 * (mass + mass.T), 0.5 * (stiffness + stiffness.T)
     damping = np.zeros_like(mass)
     if mass_damping or stiffness_damping:
+        from softgym_envs.mechanics.assembly import MassAndDamping
+
         damping = _damping(statics, modes, mass, MassAndDamping(mass_matrix, mass_damping, stiffness_damping))
     return ReducedMotion(mass, damping, stiffness, modes)
 
@@ -117,6 +121,8 @@ def _inner_modes(statics: Statics, modes: np.ndarray, mass_rows, units: np.ndarr
 
 def _damping(statics: Statics, modes: np.ndarray, mass: np.ndarray, body: MassAndDamping) -> np.ndarray:
     """Return the damping (k, k) of modes (N, k) with a reduced mass (k, k)."""
+    from softgym_envs.mechanics.solvers.schemes import StartingAcceleration
+
     model, x = statics.model, statics.x
 
     def power(mode: np.ndarray) -> float:

@@ -27,7 +27,6 @@ import numpy as np
 
 from softgym_envs.errors import DataError, InfeasibleDesign, MeshingError
 from softgym_envs.extras import explain
-from softgym_envs.mechanics.gmsh_process import set_options
 from softgym_envs.storage import atomic_write, cache_directory, read_npz
 
 _FORMAT = 2
@@ -227,6 +226,8 @@ def run_gmsh(request: dict, *, time_limit: float) -> None:
 def _draw_here(request: dict) -> None:
     """Draw in this process, mesh if the output is a mesh, and write the output."""
     import gmsh
+
+    from softgym_envs.mechanics.gmsh_process import set_options
 
     module, _, function = request["build"].partition(":")
     gmsh.initialize()
