@@ -153,7 +153,12 @@ def test_plots_show_every_complete_trial(tested):
     assert shown.pop("baseline") == [5.0] and shown.pop("winner") == [1.0]
     assert [values for values in shown.values() if values] == [[5.0, 1.0]]  # Optuna's own trace of all trials
     slices = drawn["The objective along each variable"]
-    assert len([trace for trace in slices.data if trace.name == "winner"]) == 2
+    marks = [trace for trace in slices.data if trace.name == "winner"]
+    design = results.winner.design
+    for trace in marks:
+        name = slices.layout["xaxis" + trace.xaxis[1:]].title.text.removesuffix(" [mm]").replace(" ", "_")
+        assert trace.x[0] == pytest.approx(1e3 * design[name])
+    assert len(marks) == 2
     assert "Bodies and their objective" in drawn
 
 
