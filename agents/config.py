@@ -10,6 +10,7 @@ from pydantic import (
     SerializationInfo,
     SerializerFunctionWrapHandler,
     ValidationError,
+    field_validator,
     model_serializer,
     model_validator,
 )
@@ -78,6 +79,14 @@ class EnvironmentConfig(Config):
         paths = {name: class_path(data[name]) for name in ("robot", "task") if isinstance(data.get(name), type)}
         allow_code(*paths.values())
         return {**data, **paths}
+
+    @field_validator("design", mode="before")
+    @classmethod
+    def _numbers(cls, design: Any) -> Any:
+        for name, value in design.items() if isinstance(design, dict) else ():
+            if isinstance(value, str | bool):
+                raise ValueError(f"'{name}' = {value!r} must be a number")
+        return design
 
     @model_validator(mode="after")
     def _complete(self) -> EnvironmentConfig:

@@ -7,6 +7,7 @@ complete and checked.
 from __future__ import annotations
 
 import math
+import numbers
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -15,6 +16,10 @@ import numpy as np
 
 from softgym_envs.errors import DesignError, unknown_name
 from softgym_envs.quantities import check_by_unit, check_unit
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, numbers.Real) and not isinstance(value, bool)
 
 
 @dataclass(frozen=True)
@@ -44,6 +49,9 @@ class DesignVariable:
     choices: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        for label in ("low", "high", "baseline"):
+            if not _is_number(value := getattr(self, label)):
+                raise DesignError(f"design variable '{self.name}': {label} = {value!r} must be a number")
         if not (math.isfinite(self.low) and math.isfinite(self.high)):
             raise DesignError(f"design variable '{self.name}': low {self.low} and high {self.high} must be finite")
         try:
@@ -71,6 +79,8 @@ class DesignVariable:
         unit = "" if self.unit == "1" else f" {self.unit}"
         allowed = f"allowed: {self.low:g} to {self.high:g}{unit}"
         try:
+            if isinstance(value, str | bytes | bool):
+                raise TypeError
             number = float(value)  # type: ignore[arg-type]
         except (TypeError, ValueError, OverflowError):
             raise DesignError(f"design variable '{self.name}' = {value!r} is not a number; {allowed}") from None

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import os
+import sys
 import tempfile
 import zipfile
 import zlib
@@ -146,10 +148,41 @@ class JsonLines:
 
 
 def cache_directory(name: str) -> Path:
-    """Return the folder of a cache, in ``$SOFTGYM_CACHE`` if that is set, else in the user's cache folder."""
+    """Return the folder of a cache: in ``$SOFTGYM_CACHE`` if that is set, else in the user's cache folder.
+
+    Where that cannot be written, as in a container without a home, it is in a temporary folder of the user; one line on
+    standard error says so.
+    """
     root = os.environ.get("SOFTGYM_CACHE")
     if root is None:
         from platformdirs import user_cache_dir
 
         root = user_cache_dir("softgym-envs", appauthor=False)
-    return Path(root) / name
+    return _writable_root(root) / name
+
+
+@functools.cache
+def _writable_root(root: str) -> Path:
+    if is_writable(Path(root)):
+        return Path(root)
+    private = Path(tempfile.gettempdir(), f"softgym-envs-{os.getuid() if hasattr(os, 'getuid') else 'user'}")
+    private.mkdir(mode=0o700, exist_ok=True)
+    status = private.stat()
+    if hasattr(os, "getuid") and (status.st_uid != os.getuid() or status.st_mode & 0o022):  # another user's
+        private = Path(tempfile.mkdtemp(prefix="softgym-envs-"))
+    print(
+        f"softgym-envs: caches are kept in '{private}', since '{root}' cannot be written; set SOFTGYM_CACHE",
+        file=sys.stderr,
+    )
+    os.environ["SOFTGYM_CACHE"] = str(private)  # processes started from here share it
+    return private
+
+
+def is_writable(folder: Path) -> bool:
+    """Return whether files can be written to a folder, which is made if it does not exist."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except OSError:
+        return False

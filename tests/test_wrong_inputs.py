@@ -30,6 +30,7 @@ from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.robots import Actuator, Robot
+from softgym_envs.storage import cache_directory
 from softgym_envs.surrogate.training import FitConfig
 from softgym_envs.testing import box_mesh
 
@@ -413,3 +414,27 @@ def test_mistake_ends_with_one_line(mistake, tmp_path):
     message = str(caught.value)
     assert "\n" not in message
     assert fnmatch.fnmatchcase(message, expected.replace("[", "[[]")), message
+
+
+@pytest.mark.parametrize("value", ["0.04", b"0.04", True, None, [0.04]])
+def test_numbers_of_designs_and_actuators_are_numbers(value, tmp_path):
+    with pytest.raises(ValueError, match=r"'length' = .* (is not|must be) a number"):
+        make_robot("finger").design_space.complete({"length": value})
+    with pytest.raises(ValueError, match="high = .* must be a number"):
+        DesignVariable("length", 0.01, value, 0.02, "m", "of the finger")
+    with pytest.raises(ValueError, match="high = .* must be a number"):
+        Actuator("cable", 0.0, value, 0.01)
+    if isinstance(value, str):
+        with pytest.raises(SoftGymError, match="'length' = '0.04' must be a number"):
+            config(tmp_path, StudyConfig, FINGER, "environment.design={length: '0.04'}")
+
+
+def test_caches_are_kept_elsewhere_where_nothing_can_be_written(tmp_path, monkeypatch, capfd):
+    """A container without a home: a folder below a file cannot be made, not even by root."""
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("SOFTGYM_CACHE", str(tmp_path / "file" / "cache"))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    found = cache_directory("meshes")
+    assert found.parent.parent == tmp_path and found.parent.stat().st_mode & 0o077 == 0
+    assert capfd.readouterr().err.count("\n") == 1
+    assert cache_directory("kernels").parent == found.parent and capfd.readouterr().err == ""

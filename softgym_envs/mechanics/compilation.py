@@ -18,6 +18,8 @@ from typing import Any
 import numba
 from numba.core import caching, event
 
+from softgym_envs.storage import cache_directory, is_writable
+
 ANNOUNCED = "SOFTGYM_COMPILATION_ANNOUNCED"
 """Environment variable that is set once the line has been printed; worker processes inherit it."""
 FAST = {"contract", "nsz", "reassoc"}
@@ -74,6 +76,15 @@ def _stamp_with_sources() -> None:
 
 
 _stamp_with_sources()
+
+
+def _choose_cache() -> None:
+    """Keep compiled kernels beside the package, or where that cannot be written in `cache_directory`."""
+    if not numba.config.CACHE_DIR and not is_writable(Path(__file__).parent / "__pycache__"):
+        numba.config.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"] = str(cache_directory("kernels"))
+
+
+_choose_cache()
 
 
 class _Announcement(event.Listener):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numbers
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,6 +38,10 @@ class Actuator:
 
     def __post_init__(self) -> None:
         """Check the numbers."""
+        for label in ("low", "high", "rate", "max_effort"):
+            value = getattr(self, label)
+            if not isinstance(value, numbers.Real) or isinstance(value, bool):
+                raise ValueError(f"actuator '{self.name}': {label} = {value!r} must be a number")
         check_unit(self.unit, f"actuator '{self.name}'")
         if not (np.isfinite([self.low, self.high]).all() and self.low < self.high):
             raise ValueError(f"actuator '{self.name}': low {self.low:g} must be below high {self.high:g}, both finite")
