@@ -124,6 +124,19 @@ def test_no_message_shows_a_password(address, form, tmp_path):
 
 
 @pytest.mark.parametrize(
+    "edit", [("mean_distance", "mean_effort"), ("# SHA-256", "# SHA-255"), ("trials: 3", "trials: 4")]
+)
+def test_an_edited_configuration_does_not_relabel_the_results_beside_it(edit, tmp_path):
+    config = load_config(study(tmp_path), StudyConfig)
+    RunFolder(tmp_path / "run", StudyConfig, "a co-design study").begin(config)
+    assert RunFolder(tmp_path / "run", StudyConfig, "a co-design study").config == config
+    stored = tmp_path / "run" / "config.yaml"
+    stored.write_text(stored.read_text().replace(*edit))
+    with pytest.raises(ConfigError, match="was edited after the run began"):
+        RunFolder(tmp_path / "run", StudyConfig, "a co-design study").config  # noqa: B018
+
+
+@pytest.mark.parametrize(
     ("text", "message"),
     [
         ("trials: 24\ntrials: 3\n", "line 2: key 'trials' is given twice"),

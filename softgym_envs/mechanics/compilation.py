@@ -80,8 +80,9 @@ _stamp_with_sources()
 
 def _choose_cache() -> None:
     """Keep compiled kernels beside the package, or where that cannot be written in `cache_directory`."""
-    if not numba.config.CACHE_DIR and not is_writable(Path(__file__).parent / "__pycache__"):
-        numba.config.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"] = str(cache_directory("kernels"))
+    config: Any = numba.config
+    if not config.CACHE_DIR and not is_writable(Path(__file__).parent / "__pycache__"):
+        config.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"] = str(cache_directory("kernels"))
 
 
 _choose_cache()
