@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -16,8 +16,8 @@ from softgym_envs.mechanics.constraints.constraint import Constraint
 from softgym_envs.mechanics.elements.gas import EnclosedGas
 from softgym_envs.mechanics.elements.tetrahedra import boundary_triangles
 
-if TYPE_CHECKING:
-    from softgym_envs.mechanics.model import MechanicalModel
+MechanicalModel = Any
+"""`softgym_envs.mechanics.model.MechanicalModel`, which imports this module."""
 
 
 def connected_pieces(triangles: np.ndarray) -> list[np.ndarray]:

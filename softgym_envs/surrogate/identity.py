@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
-from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.registry import class_path
 from softgym_envs.robots.base import Robot
 from softgym_envs.robots.registry import ROBOTS
@@ -59,6 +58,8 @@ def _numbers(robot: Robot, design: Any) -> dict[str, Any]:
         "volume": [model.volume],
         "positions": [float(v) for constraint in constraints for v in constraint.value(model.nodes)],
     }
+    from softgym_envs.mechanics.solvers.statics import Statics  # a surrogate that is used solves none
+
     statics, zero = Statics(model), np.zeros(len(robot.actuators))
     try:
         rest = statics.solve(zero, robot.rest_mode)
