@@ -120,6 +120,7 @@ class Episodes:
         self.plant = [own] * count
         self.stiffness, self.noise = np.ones((count, 1)), np.zeros(count)
         self.delay = np.zeros(count, dtype=np.int64)
+        self._inexact = np.zeros(count, dtype=bool)  # rows whose drives do something else than they are commanded to
         self._drives = {name: np.tile(getattr(own, name), (count, n_a)) for name in ("gain", "offset", "backlash")}
         # The last command is kept too, if the drives did something else.
         longest = 0 if self.plants is None else self.plants.longest_delay + (not self.plants.drive_exactly)
@@ -220,7 +221,7 @@ class Episodes:
 
     def set_plant(self, i: int, plant: Plant) -> None:
         """Give a row another plant, but for its cables."""
-        self.plant[i] = plant
+        self.plant[i], self._inexact[i] = plant, not plant.drives_exactly
         self.stiffness[i], self.noise[i], self.delay[i] = plant.stiffness, plant.noise, plant.delay
         for name, values in self._drives.items():
             values[i] = getattr(plant, name)
@@ -268,7 +269,7 @@ class Episodes:
         if len(self.sent) > 1:
             self.sent = np.concatenate([command[None], self.sent[:-1]])
             arriving = self.sent[self.delay, np.arange(len(self.delay))]
-        if not all(plant.drives_exactly for plant in self.plant):
+        if self._inexact.any():
             gain, offset, backlash = self._drives.values()
             arriving = play(gain * arriving + offset, self.backend.command, backlash)
         rows = range(len(self._tasks))
