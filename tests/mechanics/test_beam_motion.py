@@ -14,7 +14,8 @@ from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.solvers import block_cholesky
 from softgym_envs.mechanics.solvers.beam_body import is_beam_body
-from softgym_envs.mechanics.solvers.beam_equations import Step, assemble, motion_of, move, point_strains
+from softgym_envs.mechanics.solvers.beam_equations import Step, assemble, point_strains
+from softgym_envs.mechanics.solvers.beam_frames import motion_of, move
 from softgym_envs.mechanics.solvers.beam_motion import BeamMotion
 from softgym_envs.mechanics.solvers.dynamics import Dynamics
 from softgym_envs.mechanics.solvers.schemes import ImplicitEuler
@@ -52,6 +53,7 @@ def equations_at(solver, x, *, full=True):
         solver.step,
         solver.mass_damping,
         solver.stiffness_damping,
+        None,
     )
     assemble(body, x, solver.effort, step, beams.equations, full)
     return body, beams.equations
@@ -152,7 +154,7 @@ def test_equations_of_an_equilibrium_are_those_of_the_general_assembly(rng):
     found = model.assembly.evaluate(x, effort, model.loads)
     beams = BeamMotion(model, model.assembly.mass_matrix())
     start = np.zeros((len(beams.body.elements.frames), 2, 6))
-    step = Step(x, np.zeros_like(x), start, model.loads, np.inf, 0.0, 0.0)
+    step = Step(x, np.zeros_like(x), start, model.loads, np.inf, 0.0, 0.0, None)
     assemble(beams.body, x, effort, step, beams.equations, True)
     compare_equations(model, found, beams.body, beams.equations)
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,14 +19,14 @@ from softgym_envs.mechanics.solvers.beam_body import (
     Rows,
     Servos,
 )
-from softgym_envs.mechanics.solvers.beam_equations import Equations, make_equations
-from softgym_envs.mechanics.solvers.beam_motion import drive
-from softgym_envs.mechanics.solvers.beam_newton import Factor, make_factor
+from softgym_envs.mechanics.solvers.beam_contact import ContactPoints
+from softgym_envs.mechanics.solvers.beam_equations import Equations
+from softgym_envs.mechanics.solvers.beam_motion import BeamState, Stepping, march
+from softgym_envs.mechanics.solvers.beam_newton import Factor, System, make_system
 from softgym_envs.mechanics.solvers.block_cholesky import SIZE, BlockPattern
 
 
-@dataclass(frozen=True)
-class BeamStates:
+class BeamStates(NamedTuple):
     """States of B bodies, which a batch changes in place.
 
     Attributes:
@@ -41,6 +40,7 @@ class BeamStates:
         half: what follows from them, see `Factor`, shape (B, size, b, 6) or (0, size, b, 6).
         signs: of their pivots, shape (B, b, 6) or (0, b, 6).
         is_factored: which states have a tangent, shape (B,). Whoever changes a state must clear it.
+        anchors: of friction springs [m], shape (B, o, p, 3); None for bodies that touch nothing.
     """
 
     x: np.ndarray
@@ -52,11 +52,16 @@ class BeamStates:
     half: np.ndarray
     signs: np.ndarray
     is_factored: np.ndarray
+    anchors: np.ndarray | None
 
     @classmethod
     def of(cls, body: BeamBody, size: int, count: int, *, factors: bool) -> BeamStates:
-        """Return ``count`` states of a body with ``size`` constraint rows, all zero, which may keep their factors."""
-        frames, rows, kept = len(body.components.free), len(body.rows.kind), count if factors else 0
+        """Return ``count`` states of a body with ``size`` constraint rows, all zero, which may keep their factors.
+
+        Those of bodies that touch something keep none.
+        """
+        touches = body.contact is not None
+        frames, rows, kept = len(body.components.free), len(body.rows.kind), count if factors and not touches else 0
         return cls(
             x=np.zeros((count, rows, 3)),
             velocity=np.zeros((count, rows, 3)),
@@ -67,11 +72,14 @@ class BeamStates:
             half=np.zeros((kept, size, frames, SIZE)),
             signs=np.zeros((kept, frames, SIZE)),
             is_factored=np.zeros(count, dtype=bool),
+            anchors=None
+            if body.contact is None
+            else np.zeros((count, len(body.contact.obstacles), len(body.contact.area), 3)),
         )
 
     def copy(self) -> BeamStates:
         """Return a copy."""
-        return BeamStates(*(array.copy() for array in vars(self).values()))
+        return self._replace(**{name: array.copy() for name, array in self._asdict().items() if array is not None})
 
 
 class BeamBatch:
@@ -90,7 +98,7 @@ class BeamBatch:
         self._loads = np.ascontiguousarray(loads)
         body = bodies[0]
         size = len(body.servos.number) + 3 * len(body.points.number) + len(body.chambers.number)
-        self._equations, self._factor = make_equations(body, size), make_factor(len(body.components.free), size)
+        self._system = make_system(body, size)
         self._strains = np.zeros((len(body.elements.frames), 2, 6))
 
     def march(
@@ -131,27 +139,14 @@ class BeamBatch:
             self._bodies,
             self._loads,
             bodies,
-            self._equations,
-            self._factor,
+            self._system,
             self._strains,
-            states.x,
-            states.velocity,
-            states.effort,
-            states.delta,
-            states.compliance,
-            states.tangent,
-            states.half,
-            states.signs,
-            states.is_factored,
+            states,
             targets,
             is_driven,
             unilateral,
             limit,
-            step,
-            mass_damping,
-            stiffness_damping,
-            tolerance,
-            cuts,
+            Stepping(self._loads[0], step, mass_damping, stiffness_damping, tolerance, cuts),
             solved,
             stable,
         )
@@ -161,6 +156,8 @@ class BeamBatch:
 def _stacked(parts: Sequence[Any]) -> Any:
     """Return named tuples of arrays as one, whose arrays have a further axis in front."""
     first = parts[0]
+    if first is None:
+        return None
     if isinstance(first, np.ndarray):
         return np.stack(parts)  # a ValueError for other shapes
     return type(first)(*(_stacked(fields) for fields in zip(*parts, strict=True)))
@@ -181,42 +178,54 @@ def _body(all_bodies, k):
         Components(c.free[k], c.whole[k], c.scale[k]),
         Servos(s.number[k], s.row[k], s.directions[k]),
         Points(p.number[k], p.rows[k], p.weights[k]),
-        Chambers(h.number[k], h.rest[k], h.chamber[k], h.area[k], h.frames[k], h.weights[k], h.place[k]),
+        Chambers(h.number[k], h.rest[k], h.chamber[k], h.area[k], h.frames[k], h.weights[k], h.mount[k], h.place[k]),
+        _contact(all_bodies.contact, k),
     )
 
 
 @njit(cache=True, error_model="numpy")
+def _contact(c, k):
+    """Return the points of body ``k``, or None for bodies that touch nothing."""
+    if c is None:
+        return None
+    return ContactPoints(
+        c.groups[k],
+        c.frames[k],
+        c.blocks[k],
+        c.place[k],
+        c.share[k],
+        c.reach[k],
+        c.weights[k],
+        c.area[k],
+        c.order[k],
+        c.obstacles[k],
+        c.edges[k],
+        c.law[k],
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def _row(array, k):
+    """Return a copy of row ``k``, or None."""
+    if array is None:
+        return None
+    return array[k].copy()
+
+
+@njit(cache=True, error_model="numpy")
+def _put(array, k, row):
+    """Replace row ``k``; None has none."""
+    if array is None:
+        return
+    array[k] = row
+
+
+@njit(cache=True, error_model="numpy")
 def _march_all(
-    bodies,
-    loads,
-    numbers,
-    equations,
-    factor,
-    strains,
-    xs,
-    velocities,
-    efforts,
-    deltas,
-    compliances,
-    tangents,
-    halves,
-    signs,
-    is_factored,
-    targets,
-    is_driven,
-    unilateral,
-    limit,
-    h,
-    alpha,
-    beta,
-    tolerance,
-    cuts,
-    solved,
-    stable,
+    bodies, loads, numbers, system, strains, states, targets, is_driven, unilateral, limit, stepping, solved, stable
 ):
     """Do what `BeamBatch.march` says; ``solved`` and ``stable`` (B,) are what it returns."""
-    totals, delta = np.zeros(7), np.zeros(efforts.shape[1])
-    keeps = tangents.shape[0] > 0
+    keeps, equations, factor = states.tangent.shape[0] > 0, system.equations, system.factor
     q, f = equations, factor
     for k in range(numbers.shape[0]):
         if keeps:  # the solver works in the arrays of the state
@@ -224,43 +233,56 @@ def _march_all(
                 equations.gradient,
                 equations.momentum,
                 equations.residual,
-                tangents[k],
+                states.tangent[k],
                 equations.delta,
                 equations.H,
                 equations.energy,
+                equations.slides,
             )
             f = Factor(
-                halves[k], factor.compliance, factor.driven, signs[k], factor.step, factor.efforts, factor.turned
+                states.half[k],
+                states.half[k],
+                factor.compliance,
+                factor.driven,
+                states.signs[k],
+                factor.step,
+                factor.efforts,
+                factor.turned,
             )
-            f.compliance[:] = compliances[k]
-        x, velocity, effort = xs[k].copy(), velocities[k].copy(), efforts[k].copy()
-        taken = drive(
-            _body(bodies, numbers[k]),
-            q,
-            f,
+            f.compliance[:] = states.compliance[k]
+        state = BeamState(
+            states.x[k].copy(),
+            states.velocity[k].copy(),
+            states.effort[k].copy(),
+            states.delta[k].copy(),
+            _row(states.anchors, k),
+            np.zeros(7),
+        )
+        taken = march(
+            System(_body(bodies, numbers[k]), q, f),
             strains,
-            x,
-            velocity,
-            effort,
-            delta,
+            state,
             targets[k],
             is_driven,
             unilateral,
             limit,
-            loads[numbers[k]],
-            h,
-            alpha,
-            beta,
-            tolerance,
-            cuts,
-            totals,
-            is_factored[k] and h < np.inf,
+            Stepping(
+                loads[numbers[k]],
+                stepping.h,
+                stepping.mass_damping,
+                stepping.stiffness_damping,
+                stepping.tolerance,
+                stepping.cuts,
+            ),
+            states.is_factored[k] and stepping.h < np.inf,
         )
-        is_factored[k] = keeps and taken == targets.shape[1] and totals[6] == 1.0  # not for a part of a time step
+        whole = state.totals[6] == 1.0  # no factor for a part of a time step
+        states.is_factored[k] = keeps and taken == targets.shape[1] and whole
         if taken == targets.shape[1]:
-            solved[k], stable[k] = True, totals[5] == 0.0
-            xs[k] = x
-            velocities[k] = velocity
-            efforts[k] = effort
-            deltas[k] = equations.delta
-            compliances[k] = factor.compliance
+            solved[k], stable[k] = True, state.totals[5] == 0.0
+            states.x[k] = state.x
+            states.velocity[k] = state.velocity
+            states.effort[k] = state.effort
+            states.delta[k] = equations.delta
+            states.compliance[k] = factor.compliance
+            _put(states.anchors, k, state.anchors)

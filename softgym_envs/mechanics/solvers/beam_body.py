@@ -15,6 +15,7 @@ from softgym_envs.mechanics.elements.beams import Beam
 from softgym_envs.mechanics.elements.rigid import RigidBody
 from softgym_envs.mechanics.frames import Frames
 from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.mechanics.solvers.beam_contact import ContactPoints, contact_points, reason_against
 from softgym_envs.mechanics.solvers.block_cholesky import SIZE, BlockPattern, analyse
 
 MAX_ACTUATORS = 16
@@ -153,6 +154,7 @@ class Chambers(NamedTuple):
         area: cross-section of its line [m2], shape (t,).
         frames: first rows of the frames of its element, shape (t, 3).
         weights: of the rows of these frames, shape (t, 3, 4).
+        mount: row of the origin of the frame on which each frame is mounted, or -1, shape (t, 3).
         place: blocks of the tangent stiffness, as in `Elements`, shape (t, 3, 3).
     """
 
@@ -162,6 +164,7 @@ class Chambers(NamedTuple):
     area: np.ndarray
     frames: np.ndarray
     weights: np.ndarray
+    mount: np.ndarray
     place: np.ndarray
 
 
@@ -177,34 +180,58 @@ class BeamBody(NamedTuple):
     servos: Servos
     points: Points
     chambers: Chambers
+    contact: ContactPoints | None
 
 
-def is_beam_body(model: MechanicalModel) -> bool:
-    """Whether a model consists of quadratic beams, rigid parts, servos, chambers and points, and touches nothing."""
-    constraints = [c for c, _ in model.rows]
-    points = [c for c in constraints if isinstance(c, Point)]
+def reason_for_general(model: MechanicalModel, *, moving: bool = True) -> str | None:
+    """Return why a body needs the general solver, or None for one that compiled code can solve.
+
+    Compiled are quadratic beams and rigid parts with servos, chambers and points, and in motion what they touch.
+
+    Args:
+        model: the body.
+        moving: whether it moves in time.
+    """
+    if not any(isinstance(block, Beam) for block in model.blocks):
+        return "it has no beams"
+    for block in model.blocks:
+        if not isinstance(block, RigidBody | Beam):
+            return f"it has elements of kind {type(block).__name__}"
+        if isinstance(block, Beam) and block.order != 2:
+            return "a beam has linear elements"
+    if model.constraints["b"]:
+        return f"it has bonds, such as '{model.constraints['b'][0].name}'"
+    for constraint, _ in model.rows:
+        label = f"{type(constraint).__name__} '{constraint.name}'"
+        if not isinstance(constraint, Servo | Point | Chamber):
+            return f"{label} is not a servo, chamber or point"
+        if isinstance(constraint, Point) and constraint.embedding.node_ids.shape[1] != 4:
+            return f"{label} does not lie in one frame"
+        if isinstance(constraint, Chamber) and not _runs_along_elements(constraint, model):
+            return f"{label} does not run along quadratic elements"
+    actuators = sum(c.size for c in model.constraints["a"])
+    if actuators > MAX_ACTUATORS:
+        return f"it has {actuators} actuators, more than {MAX_ACTUATORS}"
     used = np.unique(np.concatenate([block.nodes_used for block in model.blocks]))
-    in_frames = np.concatenate([model.frames.carried, model.frames.rows])
-    return (
-        model.contact is None
-        and any(isinstance(block, Beam) for block in model.blocks)
-        and all(isinstance(b, RigidBody) or (isinstance(b, Beam) and b.order == 2) for b in model.blocks)
-        and all(isinstance(c, Servo | Point | Chamber) for c in constraints)
-        and all(_runs_along_elements(c, model) for c in constraints if isinstance(c, Chamber))
-        and sum(c.size for c in model.constraints["a"]) <= MAX_ACTUATORS
-        and not model.constraints["b"]
-        and all(p.embedding.node_ids.shape[1] == 4 for p in points)
-        and bool(np.isin(used, in_frames).all())
-    )
+    if not np.isin(used, np.concatenate([model.frames.carried, model.frames.rows])).all():
+        return "some of its nodes are not part of a frame"
+    if model.contact is not None and not moving:
+        return "it touches obstacles, at rest"
+    return reason_against(model.contact)
+
+
+def is_beam_body(model: MechanicalModel, *, moving: bool = True) -> bool:
+    """Whether compiled code can solve a body; see `reason_for_general`."""
+    return reason_for_general(model, moving=moving) is None
 
 
 def _runs_along_elements(chamber: Chamber, model: MechanicalModel) -> bool:
-    """Whether each tangent of a chamber depends on the four rows of three frames that are not mounted on others."""
+    """Whether each tangent of a chamber depends on the four rows of three frames."""
     if chamber.ids.shape[1] != 12:
         return False
     rows = chamber.ids.reshape(-1, 3, 4)
-    own = np.isin(rows[:, :, 0], model.frames.rows)
-    return bool(own.all() and (rows == rows[:, :, :1] + np.arange(4)).all())
+    origins = np.concatenate([model.frames.rows, model.frames.carried[model.frames.moves == 1.0]])
+    return bool(np.isin(rows[:, :, 0], origins).all() and (rows == rows[:, :, :1] + np.arange(4)).all())
 
 
 def beam_body(model: MechanicalModel, mass: MassMatrix) -> BeamBody:
@@ -237,9 +264,16 @@ def beam_body(model: MechanicalModel, mass: MassMatrix) -> BeamBody:
     lines = np.concatenate([np.empty((0, 12), dtype=np.int64), *(c.ids for c, _ in chambers)]).reshape(-1, 3, 4)[..., 0]
     groups = np.concatenate([element_blocks, block_of_frame[owner[lines]]])
     pairs |= {(int(i), int(j)) for group in groups for i in group for j in group if i >= 0 and j >= 0}
+    contact = None
+    if model.contact is not None:
+        contact = contact_points(model.contact, frames, _following(frames, n), np.where(kind == FIXED, -1, places))
+        pairs |= {(int(i), int(j)) for group in contact.blocks for i in group for j in group if i >= 0 and j >= 0}
     order, pattern = analyse(len(movable), pairs)
     block_of_frame[movable] = order
     block = np.where(kind == FIXED, -1, block_of_frame[owner])
+    if contact is not None:
+        moved_blocks = np.where(contact.blocks >= 0, order[contact.blocks], -1)
+        contact = contact._replace(blocks=moved_blocks, place=_element_places(moved_blocks, pattern))
 
     own = (frames.rows[:, None] + np.arange(1, 4)).ravel()
     follows = ~np.isin(frames.carried, own) & (kind[frames.carried] != FIXED)
@@ -291,20 +325,27 @@ def beam_body(model: MechanicalModel, mass: MassMatrix) -> BeamBody:
             area=np.repeat([c.area for c, _ in chambers], [len(c.ids) for c, _ in chambers]).astype(float),
             frames=np.ascontiguousarray(lines),  # of one type with bodies in a batch: one compilation serves both
             weights=np.concatenate([np.empty((0, 12)), *(c.weights for c, _ in chambers)]).reshape(-1, 3, 4),
+            mount=np.where(kind[lines] == MOUNTED, frames.rows[owner[lines]], -1),
             place=_element_places(block[lines], pattern),
         ),
+        contact=contact,
     )
 
 
-def _own_masses(matrix: csr_matrix, frames: Frames, count: int) -> csr_matrix:
-    """Return the mass matrix of ``count`` rows with the masses of rows that follow frames given to the frames' rows."""
+def _following(frames: Frames, count: int) -> csr_matrix:
+    """Return ``count`` rows as combinations of the frames' own rows: those that follow a frame, of its rows."""
     own = (frames.rows[:, None] + np.arange(4)).ravel()
     follows = ~np.isin(frames.carried, own)
     carried, origin = frames.carried[follows], frames.rows[frames.owner[follows]]
     rows = np.concatenate([own, np.repeat(carried, 4)])
     columns = np.concatenate([own, (origin[:, None] + np.arange(4)).ravel()])
     values = np.column_stack([frames.moves, frames.arm])[follows].ravel()
-    follow = csr_matrix((np.concatenate([np.ones(len(own)), values]), (rows, columns)), shape=(count, count))
+    return csr_matrix((np.concatenate([np.ones(len(own)), values]), (rows, columns)), shape=(count, count))
+
+
+def _own_masses(matrix: csr_matrix, frames: Frames, count: int) -> csr_matrix:
+    """Return the mass matrix of ``count`` rows with the masses of rows that follow frames given to the frames' rows."""
+    follow = _following(frames, count)
     found = csr_matrix(follow.T @ matrix @ follow)
     found.eliminate_zeros()
     return found
@@ -330,8 +371,8 @@ def _masses(matrix: csr_matrix, rows: np.ndarray, blocks: np.ndarray, pattern: B
 
 
 def _element_places(blocks: np.ndarray, pattern: BlockPattern) -> np.ndarray:
-    """Place of the block of each pair of frames of an element (m, 3, 3); -1 where a frame is fixed, or below."""
-    places = np.full((*blocks.shape, 3), -1)
+    """Place of the block of each pair of k frames of an element (m, k, k); -1 where a frame is fixed, or below."""
+    places = np.full((*blocks.shape, blocks.shape[1]), -1)
     for e, group in enumerate(blocks):
         for a, i in enumerate(group):
             for b, j in enumerate(group):

@@ -22,6 +22,8 @@ from softgym_envs.mechanics.elements.beam_kernels import (
     strains,
 )
 from softgym_envs.mechanics.solvers.beam_body import DIRECTOR, FIXED, ORIGIN, BeamBody
+from softgym_envs.mechanics.solvers.beam_contact import Slides, add_contact, hold_slides, make_slides
+from softgym_envs.mechanics.solvers.beam_frames import add_curvature, reduce_forces
 from softgym_envs.mechanics.solvers.block_cholesky import SIZE
 
 
@@ -36,6 +38,7 @@ class Step(NamedTuple):
         h: duration [s]; infinite for an equilibrium.
         mass_damping: Rayleigh's alpha [1/s].
         stiffness_damping: Rayleigh's beta [s].
+        anchors: of the friction springs [m], shape (o, p, 3); None for a body that touches nothing.
     """
 
     x: np.ndarray
@@ -45,6 +48,7 @@ class Step(NamedTuple):
     h: float
     mass_damping: float
     stiffness_damping: float
+    anchors: np.ndarray | None
 
 
 class Equations(NamedTuple):
@@ -58,6 +62,7 @@ class Equations(NamedTuple):
         delta: values of the constraints, shape (size,).
         H: their gradients, shape (size, b, 6).
         energy: elastic energy [J], shape (1,).
+        slides: terms of sliding points; None for a body that touches nothing.
     """
 
     gradient: np.ndarray
@@ -67,6 +72,7 @@ class Equations(NamedTuple):
     delta: np.ndarray
     H: np.ndarray
     energy: np.ndarray
+    slides: Slides | None
 
 
 def make_equations(body: BeamBody, size: int) -> Equations:
@@ -80,6 +86,7 @@ def make_equations(body: BeamBody, size: int) -> Equations:
         delta=np.zeros(size),
         H=np.zeros((size, count, SIZE)),
         energy=np.zeros(1),
+        slides=make_slides(body.contact, count),
     )
 
 
@@ -94,18 +101,19 @@ def point_strains(elements, x, out):
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
-def drag_work(elements, x, step):
-    """Return the work [J] that the stiffness damping takes on the way to rows ``x`` (n, 3)."""
+def strain_work(elements, x, step):
+    """Return the elastic energy at rows ``x`` (n, 3), and the work that damping takes on the way there [J]."""
     z, end = np.empty((7, 3)), np.empty(6)
-    work = 0.0
+    elastic, work = 0.0, 0.0
     for e in range(elements.frames.shape[0]):
         for q in range(2):
             interpolate(x, elements.frames[e], elements.shape[q], elements.slope[e, q], z)
             strains(z, end)
             for s in range(6):
-                change = end[s] - step.strains[e, q, s]
-                work += step.stiffness_damping / step.h * elements.stiffness[e, q, s] * change**2
-    return work
+                stiffness = elements.stiffness[e, q, s]
+                elastic += 0.5 * stiffness * (end[s] - elements.rest[e, q, s]) ** 2
+                work += stiffness * (end[s] - step.strains[e, q, s]) ** 2
+    return elastic, step.stiffness_damping / step.h * work
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
@@ -287,64 +295,6 @@ def _add_inertia(masses, x, step, equations, full):
             block[3 + j, n] -= factor * r
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
-def _reduce(frames, x, forces, out):
-    """Fill ``out`` (b, 6) with the forces and moments of ``forces`` (n, 3) on the frames.
-
-    The forces on rows that follow a frame are replaced by those on its own rows.
-    """
-    for k in range(frames.mounted.shape[0]):
-        row, owner, arm = frames.mounted[k], frames.owner[k], frames.arm[k]
-        p, q, r = forces[row, 0], forces[row, 1], forces[row, 2]
-        moves, a, b, g = frames.moves[k], arm[0], arm[1], arm[2]
-        for d, force in ((0, p), (1, q), (2, r)):
-            forces[owner, d] += moves * force
-            forces[owner + 1, d] += a * force
-            forces[owner + 2, d] += b * force
-            forces[owner + 3, d] += g * force
-            forces[row, d] = 0.0
-    for f in range(frames.rows.shape[0]):
-        row, target = frames.rows[f], out[frames.block[f]]
-        a, b, c = 0.0, 0.0, 0.0
-        for k in range(row + 1, row + 4):
-            p, q, r = x[k, 0], x[k, 1], x[k, 2]
-            u, v, w = forces[k, 0], forces[k, 1], forces[k, 2]
-            a += q * w - r * v
-            b += r * u - p * w
-            c += p * v - q * u
-        target[0], target[1], target[2] = forces[row, 0], forces[row, 1], forces[row, 2]
-        target[3], target[4], target[5] = a, b, c
-
-
-@njit(cache=True, error_model="numpy", fastmath=FAST)
-def _add_curvature(frames, x, gradient, tangent):
-    """Add the second derivative of rotations, ``(g d^T + d g^T) / 2 - (g . d) 1`` for each director.
-
-    Forces on rows that follow a frame must have been replaced by those on its own rows.
-    """
-    for f in range(frames.rows.shape[0]):
-        row, block = frames.rows[f], tangent[frames.block[f]]
-        a, b, c, p, q, r = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        for k in range(row + 1, row + 4):
-            u, v, w = x[k, 0], x[k, 1], x[k, 2]
-            e, h, g = gradient[k, 0], gradient[k, 1], gradient[k, 2]
-            a += e * u
-            b += h * v
-            c += g * w
-            p += e * v + h * u
-            q += e * w + g * u
-            r += h * w + g * v
-        block[3, 3] -= b + c
-        block[4, 4] -= a + c
-        block[5, 5] -= a + b
-        block[3, 4] += 0.5 * p
-        block[4, 3] += 0.5 * p
-        block[3, 5] += 0.5 * q
-        block[5, 3] += 0.5 * q
-        block[4, 5] += 0.5 * r
-        block[5, 4] += 0.5 * r
-
-
 @njit(cache=True, error_model="numpy")
 def add_constraints(body, x, effort, equations, full):
     """Fill the values of the constraints, and subtract the forces of their efforts; if ``full``, fill ``H``, too."""
@@ -431,13 +381,16 @@ def _add_chambers(chambers, rows, x, effort, equations, full):
                     gradient[frames[a] + k, d] -= pull * weights[a, k] * t[d]
         if not full:
             continue
-        # The motion of the tangent: frame a moves it by weights[a, 0] u + w x p.
+        # The motion of the tangent: frame a, or the one on which it is mounted, moves it by weights[a, 0] u + w x p.
         for a in range(3):
+            mount = chambers.mount[q, a]
             for d in range(3):
                 e, f = (d + 1) % 3, (d + 2) % 3
                 p = 0.0
                 for k in range(1, 4):
                     p += weights[a, k] * x[frames[a] + k, d]
+                if mount >= 0:
+                    p += weights[a, 0] * (x[frames[a], d] - x[mount, d])
                 for g in range(3):
                     motion[g, 6 * a + d] = weights[a, 0] if g == d else 0.0
                 # w x p has the components w_f p_d along e and -w_e p_d along f.
@@ -502,84 +455,13 @@ def assemble(body, x, effort, step, equations, full):
     _add_elements(body.elements, x, step, equations, full)
     _add_inertia(body.masses, x, step, equations, full)
     add_constraints(body, x, effort, equations, full)
-    _reduce(body.frames, x, gradient, equations.residual)
+    add_contact(body.contact, equations.slides, x, step.anchors, equations, full)
+    reduce_forces(body.frames, x, gradient, equations.residual)
     free, residual = body.components.free, equations.residual
     for k in range(free.shape[0]):
         for i in range(6):
             residual[k, i] *= free[k, i]
     if full:
-        _add_curvature(body.frames, x, gradient, equations.tangent)
+        add_curvature(body.frames, x, gradient, equations.tangent)
         _hold(body.pattern, body.components, equations)
-
-
-@njit(cache=True, error_model="numpy", fastmath=FAST)
-def orthonormalise(frames, x):
-    """Orthonormalise the directors of the frames in place, so that round-off does not accumulate over a long motion."""
-    turned, gram = np.empty((3, 3)), np.empty((3, 3))
-    for f in range(frames.rows.shape[0]):
-        row = frames.rows[f]
-        for k in range(3):
-            for d in range(3):
-                turned[k, d] = x[row + 1 + k, d]
-        for k in range(3):
-            for m in range(3):
-                gram[k, m] = turned[k, 0] * turned[m, 0] + turned[k, 1] * turned[m, 1] + turned[k, 2] * turned[m, 2]
-        for k in range(3):
-            for d in range(3):
-                value = 1.5 * turned[k, d]
-                for m in range(3):
-                    value -= 0.5 * gram[k, m] * turned[m, d]
-                x[row + 1 + k, d] = value
-
-
-@njit(cache=True, error_model="numpy", fastmath=FAST)
-def move(frames, x, motion, turned):
-    """Move the frames in place by ``motion`` (b, 6): displacements of their origins [m], and spins [rad].
-
-    ``turned`` (3, 3) is a work array. Call `orthonormalise` from time to time.
-    """
-    for f in range(frames.rows.shape[0]):
-        row, step = frames.rows[f], motion[frames.block[f]]
-        a, b, c = step[3], step[4], step[5]
-        square = a * a + b * b + c * c
-        if square < 1e-3:  # sin(t) / t and (1 - cos(t)) / t^2 to rounding
-            first = 1.0 - square / 6.0 * (1.0 - square / 20.0 * (1.0 - square / 42.0 * (1.0 - square / 72.0)))
-            second = 0.5 - square / 24.0 * (1.0 - square / 30.0 * (1.0 - square / 56.0 * (1.0 - square / 90.0)))
-        else:
-            angle = np.sqrt(square)
-            half = np.sin(0.5 * angle)
-            first, second = np.sin(angle) / angle, 2.0 * half * half / square
-        for k in range(3):
-            p, q, r = x[row + 1 + k, 0], x[row + 1 + k, 1], x[row + 1 + k, 2]
-            u, v, w = b * r - c * q, c * p - a * r, a * q - b * p
-            turned[k, 0] = p + first * u + second * (b * w - c * v)
-            turned[k, 1] = q + first * v + second * (c * u - a * w)
-            turned[k, 2] = r + first * w + second * (a * v - b * u)
-        for k in range(3):
-            for d in range(3):
-                x[row + 1 + k, d] = turned[k, d]
-        for d in range(3):
-            x[row, d] += step[d]
-    for c in range(frames.mounted.shape[0]):
-        row, origin = frames.mounted[c], frames.owner[c]
-        for d in range(3):
-            value = frames.moves[c] * x[origin, d]
-            for k in range(3):
-                value += frames.arm[c, k] * x[origin + 1 + k, d]
-            x[row, d] = value
-
-
-@njit(cache=True, error_model="numpy", fastmath=FAST)
-def motion_of(frames, free, x, velocity, h, out):
-    """Fill ``out`` (b, 6) with ``h`` times the motion of the frames at ``x`` (n, 3) with velocities of the rows."""
-    for f in range(frames.rows.shape[0]):
-        row, block = frames.rows[f], frames.block[f]
-        for i in range(3):
-            j, k = (i + 1) % 3, (i + 2) % 3
-            out[block, i] = h * velocity[row, i]
-            spin = 0.0
-            for m in range(1, 4):
-                spin += x[row + m, j] * velocity[row + m, k] - x[row + m, k] * velocity[row + m, j]
-            out[block, 3 + i] = 0.5 * h * spin
-        for i in range(6):
-            out[block, i] *= free[block, i]
+        hold_slides(equations.slides, free)

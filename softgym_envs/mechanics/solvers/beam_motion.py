@@ -13,24 +13,41 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numba import types
+from numba.extending import overload
 
 from softgym_envs.mechanics.assembly import MassMatrix
 from softgym_envs.mechanics.compilation import njit
+from softgym_envs.mechanics.contact.contact import Contact, ContactMemory, Contacts
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.solvers.beam_body import beam_body, is_beam_body
+from softgym_envs.mechanics.solvers.beam_body import beam_body
+from softgym_envs.mechanics.solvers.beam_contact import (
+    ContactPoints,
+    Slides,
+    commit,
+    free_part,
+    has_failed,
+    touching,
+)
 from softgym_envs.mechanics.solvers.beam_equations import (
     Step,
     add_constraints,
     assemble,
-    drag_work,
-    make_equations,
-    motion_of,
-    move,
     multiply_mass,
-    orthonormalise,
     point_strains,
+    strain_work,
 )
-from softgym_envs.mechanics.solvers.beam_newton import approach, factorise_tangent, invert_driven, make_factor, solve
+from softgym_envs.mechanics.solvers.beam_frames import motion_of, move, orthonormalise
+from softgym_envs.mechanics.solvers.beam_newton import (
+    Drive,
+    approach,
+    factorise_tangent,
+    invert_driven,
+    make_system,
+    solve,
+    solve_in_contact,
+)
+from softgym_envs.mechanics.solvers.block_cholesky import SIZE
 from softgym_envs.mechanics.solvers.equilibrium import SATURATED
 
 INCREMENTS = 4
@@ -49,12 +66,15 @@ class MarchedSteps(NamedTuple):
         delta: their values, shape (size,).
         compliance: ``W`` at the end, shape (size, size).
         kinetic: kinetic energy at the end [J].
-        elastic: elastic energy at the end [J].
+        elastic: energy stored in elements and contacts at the end [J].
         work: done by efforts on these steps [J].
-        dissipated: by damping on these steps [J].
+        dissipated: by damping and friction on these steps [J].
         iterations: Newton iterations of the last time step.
         stable: whether the tangent at the end is positive definite.
         parts: of the last time step.
+        slides: whether points slide at the end, so that ``W`` is not symmetric.
+        contacts: where the body touches at the end; None for a body that touches nothing.
+        memory: what friction remembers; None likewise.
     """
 
     taken: int
@@ -71,64 +91,177 @@ class MarchedSteps(NamedTuple):
     iterations: int
     stable: bool
     parts: int
+    slides: bool
+    contacts: Contacts | None
+    memory: ContactMemory | None
+
+
+class BeamState(NamedTuple):
+    """What a step changes.
+
+    Attributes:
+        x: rows [m], shape (n, 3).
+        velocity: of the rows [m/s], shape (n, 3).
+        effort: of all constraint rows, shape (size,).
+        delta: their values, shape (size,).
+        anchors: of friction springs [m], shape (o, p, 3); None for a body that touches nothing.
+        totals: kinetic and stored energy, work, dissipation, the iterations of the last time step, the number of
+            negative eigenvalues of the tangent at its end, and the number of its parts, shape (7,).
+    """
+
+    x: np.ndarray
+    velocity: np.ndarray
+    effort: np.ndarray
+    delta: np.ndarray
+    anchors: np.ndarray | None
+    totals: np.ndarray
+
+
+class Stepping(NamedTuple):
+    """How time steps are taken.
+
+    Attributes:
+        loads: dead loads [N], shape (n, 3).
+        h: duration of a step [s]; infinite for equilibria.
+        mass_damping: Rayleigh's alpha [1/s].
+        stiffness_damping: Rayleigh's beta [s].
+        tolerance: largest remaining correction of any row [m].
+        cuts: how often a time step that cannot be solved is halved, along with the way to its target.
+    """
+
+    loads: np.ndarray
+    h: float
+    mass_damping: float
+    stiffness_damping: float
+    tolerance: float
+    cuts: int
 
 
 @njit(cache=True, error_model="numpy")
-def _advance(
-    body,
-    equations,
-    factor,
-    start,
-    x,
-    velocity,
-    effort,
-    delta,
-    target,
-    driven,
-    forced,
-    one_way,
-    loads,
-    h,
-    alpha,
-    beta,
-    tolerance,
-    totals,
-    fresh,
-    easy,
-    thorough,
-    finish,
-):
-    """Take one time step in place; whether that succeeds.
+def _copied(array):
+    """Return a copy of an array, or None."""
+    if array is None:
+        return None
+    return array.copy()
 
-    It is tried with the factor of the last step unless ``fresh``, with whole steps if ``easy``, and then with shortened
-    ones if ``thorough``. For the other arguments see `_march`.
-    """
-    size = effort.shape[0]
-    kept, kept_velocity, kept_effort = x.copy(), velocity.copy(), effort.copy()
-    point_strains(body.elements, x, start)
-    step = Step(kept, kept_velocity, start, loads, h, alpha, beta)
-    if h < np.inf:  # start from where the current velocity leads
-        motion_of(body.frames, body.components.free, x, velocity, h, factor.step)
+
+@njit(cache=True, error_model="numpy")
+def _put_back(array, kept):
+    """Give an array its former values; None has none."""
+    if array is None:
+        return
+    array[:] = kept
+
+
+@njit(cache=True, error_model="numpy")
+def copy_state(state):
+    """Return a copy of a state."""
+    return BeamState(
+        state.x.copy(),
+        state.velocity.copy(),
+        state.effort.copy(),
+        state.delta.copy(),
+        _copied(state.anchors),
+        state.totals.copy(),
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def restore_state(state, kept):
+    """Give a state the values of its copy."""
+    state.x[:] = kept.x
+    state.velocity[:] = kept.velocity
+    state.effort[:] = kept.effort
+    state.delta[:] = kept.delta
+    _put_back(state.anchors, kept.anchors)
+    state.totals[:] = kept.totals
+
+
+@njit(cache=True, error_model="numpy")
+def _predict(contact, slides, body, factor, start, x):
+    """Move rows ``x`` as far along the step of ``factor`` as no point enters an obstacle."""
+    move(body.frames, x, factor.step, factor.turned)
+    if contact is None:
+        return
+    while True:
+        part = free_part(contact, slides, start, x)
+        if part == 1.0:
+            return
+        for k in range(factor.step.shape[0]):
+            for i in range(SIZE):
+                factor.step[k, i] *= part
+        x[:] = start
         move(body.frames, x, factor.step, factor.turned)
-    predicted = x.copy()
+
+
+@njit(cache=True, error_model="numpy")
+def _find_free(system, x, effort, target, drive, step, stepping, fresh, easy):
+    """Do what `_find` says for a body that touches nothing."""
+    h, tolerance = step.h, stepping.tolerance
+    predicted, kept_effort = x.copy(), effort.copy()
     iterations = -1
     if easy:
-        system = (driven, forced, one_way, step, equations, factor, tolerance)
-        iterations = solve(body, x, effort, target, *system, fresh)
+        iterations = solve(system, x, effort, target, drive, step, tolerance, fresh)
         if iterations < 0 and h < np.inf and not fresh:
             x[:] = predicted
             effort[:] = kept_effort
-            iterations = solve(body, x, effort, target, *system, True)
-    if iterations < 0 and thorough:
+            iterations = solve(system, x, effort, target, drive, step, tolerance, True)
+    if iterations < 0 and stepping.cuts > 0:
         x[:] = predicted
         effort[:] = kept_effort
-        iterations = approach(body, x, effort, target, driven, forced, one_way, step, equations, factor, tolerance)
+        iterations = approach(system, x, effort, target, drive, step, tolerance)
+    return iterations
+
+
+@njit(cache=True, error_model="numpy")
+def _find_touching(system, x, effort, target, drive, step, stepping, fresh, easy):
+    """Do what `_find` says for a body that may touch."""
+    return solve_in_contact(system, x, effort, target, drive, step, stepping.tolerance, fresh)
+
+
+def _find(system, x, effort, target, drive, step, stepping, fresh, easy):
+    """Solve the equations of one time step from the predicted rows; the iterations, or -1 on failure."""
+    found = _find_free if system.body.contact is None else _find_touching
+    return found(system, x, effort, target, drive, step, stepping, fresh, easy)
+
+
+@overload(_find)
+def _compiled_find(system, x, effort, target, drive, step, stepping, fresh, easy):
+    """Choose when a kernel is compiled, so that only one of both is."""
+    touches = not isinstance(system.types[0].types[system.types[0].fields.index("contact")], types.NoneType)
+    found = _find_touching if touches else _find_free
+
+    def find(system, x, effort, target, drive, step, stepping, fresh, easy):
+        return found(system, x, effort, target, drive, step, stepping, fresh, easy)
+
+    return find
+
+
+@njit(cache=True, error_model="numpy")
+def _advance(system, strains, state, target, drive, stepping, h, fresh, easy, finish):
+    """Take one time step of duration ``h`` in place; whether that succeeds.
+
+    It is tried with the factor of the last step unless ``fresh``, with whole steps if ``easy``, and then with shortened
+    ones if time steps may be halved. For the other arguments see `march_rows`.
+    """
+    body, equations, factor = system
+    x, velocity, effort, delta, totals = state.x, state.velocity, state.effort, state.delta, state.totals
+    alpha, size = stepping.mass_damping, effort.shape[0]
+    start, kept_effort = x.copy(), effort.copy()
+    point_strains(body.elements, x, strains)
+    step = Step(start, velocity.copy(), strains, stepping.loads, h, alpha, stepping.stiffness_damping, state.anchors)
+    if h < np.inf:  # start from where the current velocity leads
+        motion_of(body.frames, body.components.free, x, velocity, h, factor.step)
+        _predict(body.contact, equations.slides, body, factor, start, x)
+    iterations = _find(system, x, effort, target, drive, step, stepping, fresh, easy)
     if iterations < 0:
         return False
     # At the end of the step: all compliances where they are asked for, else values and energies alone.
     if finish:
         assemble(body, x, effort, step, equations, True)
-        negative = factorise_tangent(body, equations, factor, np.arange(size))
+        if has_failed(equations.slides):
+            return False
+        negative = factorise_tangent(system, np.arange(size))
         totals[5] = negative
         if negative < 0 or (negative and h == np.inf):
             return False
@@ -139,7 +272,7 @@ def _advance(
         return True
     for i in range(x.shape[0]):
         for d in range(3):
-            velocity[i, d] = (x[i, d] - kept[i, d]) / h
+            velocity[i, d] = (x[i, d] - start[i, d]) / h
     for c in range(size):
         totals[2] += 0.5 * (kept_effort[c] + effort[c]) * (equations.delta[c] - delta[c])
     delta[:] = equations.delta
@@ -151,156 +284,85 @@ def _advance(
         for d in range(3):
             kinetic += 0.5 * velocity[i, d] * momentum[i, d]
     totals[0] = kinetic
-    totals[3] += drag_work(body.elements, x, step) + 2.0 * alpha * h * kinetic
+    totals[1], drag = strain_work(body.elements, x, step)
+    totals[3] += drag + 2.0 * alpha * h * kinetic
+    commit(body.contact, equations.slides, x, state.anchors, totals)
     return True
 
 
 @njit(cache=True, error_model="numpy")
-def _march(
-    body,
-    equations,
-    factor,
-    start,
-    x,
-    velocity,
-    effort,
-    delta,
-    targets,
-    driven,
-    forced,
-    one_way,
-    limit,
-    loads,
-    h,
-    alpha,
-    beta,
-    tolerance,
-    cuts,
-    totals,
-    finish,
-    known,
-):
+def march_rows(system, strains, state, targets, drive, limit, stepping, finish, known):
     """Take time steps in place until one fails or exceeds a limit, which is undone; the number of steps taken.
 
-    A time step that fails is halved up to ``cuts`` times, along with the way to its target. ``totals`` (7,) receives
-    kinetic and elastic energy, work, dissipation, the iterations of the last step, the number of negative eigenvalues
-    of the tangent at its end, and the number of its parts. Only if ``finish``, this one and the compliances are those
-    at the end of the last step. ``known`` says that ``factor`` is that of the tangent at the start, with ``W`` of all
-    rows and for the same ``h``.
+    Only if ``finish``, the compliances and the number of negative eigenvalues are those at the end of the last step.
+    ``known`` says that the factor is that of the tangent at the start, with ``W`` of all rows and for the same duration
+    of a step.
     """
-    kept, kept_velocity, kept_effort, kept_totals = x.copy(), velocity.copy(), effort.copy(), totals.copy()
+    kept, effort = copy_state(state), state.effort
     first, goal = np.empty(effort.shape[0]), np.empty(effort.shape[0])
-    orthonormalise(body.frames, x)
-    add_constraints(body, x, effort, equations, False)
-    delta[:] = equations.delta
-    kept_delta = delta.copy()
+    orthonormalise(system.body.frames, state.x)
+    add_constraints(system.body, state.x, effort, system.equations, False)
+    state.delta[:] = system.equations.delta
     fresh = not known
     if known:
-        invert_driven(factor, driven)
+        invert_driven(system.factor, drive.driven)
     for k in range(targets.shape[0]):
-        kept[:] = x
-        kept_effort[:] = effort
-        kept_velocity[:] = velocity
-        kept_delta[:] = delta
-        kept_totals[:] = totals
+        restore_state(kept, state)
         first[:] = effort
-        for i in range(driven.shape[0]):
-            first[driven[i]] = delta[driven[i]]
+        for i in range(drive.driven.shape[0]):
+            first[drive.driven[i]] = state.delta[drive.driven[i]]
         parts, good = 1, False
-        for cut in range(cuts + 1):
+        for cut in range(stepping.cuts + 1):
             parts = 2**cut
             for j in range(parts):
                 for c in range(goal.shape[0]):
                     goal[c] = targets[k, c]
                     if j < parts - 1:
                         goal[c] = first[c] + (j + 1) / parts * (goal[c] - first[c])
-                good = _advance(
-                    body,
-                    equations,
-                    factor,
-                    start,
-                    x,
-                    velocity,
-                    effort,
-                    delta,
-                    goal,
-                    driven,
-                    forced,
-                    one_way,
-                    loads,
-                    h / parts,
-                    alpha,
-                    beta,
-                    tolerance,
-                    totals,
-                    fresh,
-                    parts == 1,
-                    cuts > 0,
-                    finish and k == targets.shape[0] - 1 and j == parts - 1,
-                )
+                last = finish and k == targets.shape[0] - 1 and j == parts - 1
+                h = stepping.h / parts
+                good = _advance(system, strains, state, goal, drive, stepping, h, fresh, parts == 1, last)
                 fresh = False
                 if not good:
                     break
             if good:
                 break
             fresh = True  # the duration changes
-            x[:] = kept
-            effort[:] = kept_effort
-            velocity[:] = kept_velocity
-            delta[:] = kept_delta
-            totals[:] = kept_totals
+            restore_state(state, kept)
         fresh = fresh or parts > 1
-        totals[6] = parts
+        state.totals[6] = parts
         for i in range(limit.shape[0]):
             good = good and abs(effort[i]) <= limit[i]
         if not good:
-            x[:] = kept
-            effort[:] = kept_effort
-            velocity[:] = kept_velocity
-            totals[:] = kept_totals
+            restore_state(state, kept)
             return k
     return targets.shape[0]
 
 
 @njit(cache=True, error_model="numpy")
-def drive(
-    body,
-    equations,
-    factor,
-    start,
-    x,
-    velocity,
-    effort,
-    delta,
-    targets,
-    is_driven,
-    unilateral,
-    limit,
-    loads,
-    h,
-    alpha,
-    beta,
-    tolerance,
-    cuts,
-    totals,
-    known,
-):
-    """Take time steps as `_march`, in which driven actuators stop at their largest effort ``limit`` (l,).
+def drive_rows(is_driven, unilateral):
+    """Return how rows are commanded, given which are driven, shape (size,), and which cannot push, shape (n_a,)."""
+    driven = np.flatnonzero(is_driven)
+    one_way = np.zeros(driven.shape[0], dtype=np.bool_)
+    for i in range(driven.shape[0]):
+        one_way[i] = driven[i] < unilateral.shape[0] and unilateral[driven[i]]
+    return Drive(driven, np.flatnonzero(~is_driven), one_way)
+
+
+@njit(cache=True, error_model="numpy")
+def march(system, strains, state, targets, is_driven, unilateral, limit, stepping, known):
+    """Take time steps as `march_rows`, in which driven actuators stop at their largest effort ``limit`` (l,).
 
     An actuator that would exceed its limit is driven by that effort instead, until its command asks for less than it
     has reached. Returns the number of steps taken, all of them only with the factor of the tangent at the end.
     """
-    count, steps = limit.shape[0], targets.shape[0]
-    driven, forced = np.flatnonzero(is_driven), np.flatnonzero(~is_driven)
-    one_way = np.zeros(driven.shape[0], dtype=np.bool_)
-    for i in range(driven.shape[0]):
-        one_way[i] = unilateral[driven[i]]
+    count, steps, effort = limit.shape[0], targets.shape[0], state.effort
+    drive = drive_rows(is_driven, unilateral)
     bound = np.full(count, np.inf)
     for i in range(count):
         if is_driven[i]:
             bound[i] = limit[i]
-    free, sign = is_driven.copy(), np.zeros(count)
-    kept, kept_velocity, kept_effort, kept_totals = x.copy(), velocity.copy(), effort.copy(), totals.copy()
+    free, sign, kept = is_driven.copy(), np.zeros(count), copy_state(state)
     taken = 0
     while taken < steps:
         saturated = False
@@ -309,75 +371,23 @@ def drive(
             free[i] = is_driven[i] and abs(effort[i]) < SATURATED * bound[i]
             saturated = saturated or free[i] != is_driven[i]
         if not saturated:
-            done = _march(
-                body,
-                equations,
-                factor,
-                start,
-                x,
-                velocity,
-                effort,
-                delta,
-                targets[taken:],
-                driven,
-                forced,
-                one_way,
-                bound,
-                loads,
-                h,
-                alpha,
-                beta,
-                tolerance,
-                cuts,
-                totals,
-                True,
-                known and taken == 0 and not one_way.any(),
-            )
+            follows = known and taken == 0 and not drive.one_way.any()
+            done = march_rows(system, strains, state, targets[taken:], drive, bound, stepping, True, follows)
             taken += done
             if done or count == 0:
                 if done == 0:
                     return taken
                 continue
         # One step, with the set of saturated actuators that is consistent.
-        kept[:] = x
-        kept_velocity[:] = velocity
-        kept_effort[:] = effort
-        kept_totals[:] = totals
+        restore_state(kept, state)
         consistent = False
         for attempt in range(2 * count + 2):
             target = targets[taken : taken + 1].copy()
             for i in range(count):
                 if is_driven[i] and not free[i]:
                     target[0, i] = sign[i] * bound[i]
-            among = np.flatnonzero(free)
-            way = np.zeros(among.shape[0], dtype=np.bool_)
-            for i in range(among.shape[0]):
-                way[i] = unilateral[among[i]]
-            done = _march(
-                body,
-                equations,
-                factor,
-                start,
-                x,
-                velocity,
-                effort,
-                delta,
-                target,
-                among,
-                np.flatnonzero(~free),
-                way,
-                np.zeros(0),
-                loads,
-                h,
-                alpha,
-                beta,
-                tolerance,
-                cuts,
-                totals,
-                taken == steps - 1,
-                False,
-            )
-            if not done:
+            among, last = drive_rows(free, unilateral), taken == steps - 1
+            if not march_rows(system, strains, state, target, among, np.zeros(0), stepping, last, False):
                 break
             consistent = True
             for i in range(count):
@@ -385,20 +395,14 @@ def drive(
                     free[i], sign[i], consistent = False, np.sign(effort[i]), False
                 elif is_driven[i] and not free[i]:
                     # Stop releasing actuators after a while, so that the loop terminates.
-                    behind = sign[i] * (targets[taken, i] - equations.delta[i]) < 0.0
+                    behind = sign[i] * (targets[taken, i] - system.equations.delta[i]) < 0.0
                     if behind and attempt <= count:
                         free[i], consistent = True, False
             if consistent:
                 break
-            x[:] = kept
-            velocity[:] = kept_velocity
-            effort[:] = kept_effort
-            totals[:] = kept_totals
+            restore_state(state, kept)
         if not consistent:
-            x[:] = kept
-            velocity[:] = kept_velocity
-            effort[:] = kept_effort
-            totals[:] = kept_totals
+            restore_state(state, kept)
             return taken
         taken += 1
     return taken
@@ -413,17 +417,11 @@ class BeamMotion:
     """
 
     def __init__(self, model: MechanicalModel, mass: MassMatrix) -> None:
-        self.body = beam_body(model, mass)
+        self.system = make_system(beam_body(model, mass), model.assembly.size)
+        self.body, self.equations = self.system.body, self.system.equations
         self.elasticity_version = model.elasticity_version
-        size, count = model.assembly.size, len(self.body.components.free)
-        self.equations = make_equations(self.body, size)
-        self._factor = make_factor(count, size)
-        self._strains = np.zeros((len(self.body.elements.frames), 2, 6))
-
-    @classmethod
-    def of(cls, model: MechanicalModel, mass: MassMatrix) -> BeamMotion | None:
-        """Return the compiled time steps of a model, or None for a model that needs the general solver."""
-        return cls(model, mass) if is_beam_body(model) else None
+        self._contact = model.contact
+        self.strains = np.zeros((len(self.body.elements.frames), 2, 6))
 
     def march(
         self,
@@ -441,6 +439,7 @@ class BeamMotion:
         stiffness_damping: float,
         tolerance: float,
         cuts: int = 0,
+        memory: ContactMemory | None = None,
     ) -> MarchedSteps:
         """Take time steps until one cannot be solved; driven actuators stop at their largest effort.
 
@@ -458,48 +457,49 @@ class BeamMotion:
             stiffness_damping: Rayleigh's beta [s].
             tolerance: largest remaining correction of any row [m].
             cuts: how often a time step that cannot be solved is halved.
+            memory: what friction remembers at the start; needed by a body that touches.
         """
-        x, velocity, effort, delta = x.copy(), velocity.copy(), effort.copy(), np.empty(len(effort))
-        totals = np.zeros(7)
-        count = drive(
-            self.body,
-            self.equations,
-            self._factor,
-            self._strains,
-            x,
-            velocity,
-            effort,
-            delta,
+        contact, anchors = self.body.contact, None
+        if contact is not None:
+            assert memory is not None
+            anchors = anchors_of(contact, memory)
+        state = BeamState(x.copy(), velocity.copy(), effort.copy(), np.empty(len(effort)), anchors, np.zeros(7))
+        count = march(
+            self.system,
+            self.strains,
+            state,
             targets,
             is_driven,
             unilateral,
             limit,
-            loads,
-            step,
-            mass_damping,
-            stiffness_damping,
-            tolerance,
-            cuts,
-            totals,
+            Stepping(loads, step, mass_damping, stiffness_damping, tolerance, cuts),
             False,  # what follows from a state must not depend on what was computed before
         )
-        kinetic, elastic, work, dissipated, iterations, negative, parts = totals.tolist()
-        delta = self.equations.delta.copy() if count else delta
+        kinetic, stored, work, dissipated, iterations, negative, parts = state.totals.tolist()
+        equations, slides = self.equations, self.equations.slides
+        contacts, remembered = None, None
+        if contact is not None and count:
+            assert self._contact is not None and slides is not None and memory is not None and anchors is not None
+            contacts = contacts_of(self._contact, contact, slides, state.x)
+            remembered = memory_of(contact, anchors, memory)
         return MarchedSteps(
             count,
             count == len(targets),
-            x,
-            velocity,
-            effort,
-            delta,
-            self._factor.compliance.copy(),
+            state.x,
+            state.velocity,
+            state.effort,
+            equations.delta.copy() if count else state.delta,
+            self.system.factor.compliance.copy(),
             kinetic,
-            elastic,
+            stored,
             work,
             dissipated,
             int(iterations),
             negative == 0,
             int(parts),
+            slides is not None and slides.number[0] > 0,
+            contacts,
+            remembered,
         )
 
     def balance(
@@ -550,3 +550,41 @@ class BeamMotion:
             targets = start + np.arange(1, INCREMENTS + 1)[:, None] / INCREMENTS * (target - start)
             targets[-1] = target
         return found
+
+
+def anchors_of(contact: ContactPoints, memory: ContactMemory) -> np.ndarray:
+    """Return the anchors of compiled points [m], shape (o, p, 3); without friction they are not used."""
+    anchors = np.zeros((len(contact.obstacles), len(contact.order), 3))
+    for own, kept in zip(anchors, memory.anchors, strict=True):
+        if kept is not None:
+            own[:] = kept[contact.order]
+    return anchors
+
+
+def memory_of(contact: ContactPoints, anchors: np.ndarray, memory: ContactMemory) -> ContactMemory:
+    """Return a memory whose anchors of compiled points are those given, shape (o, p, 3)."""
+    found = [None if kept is None else kept.copy() for kept in memory.anchors]
+    for own, kept in zip(anchors, found, strict=True):
+        if kept is not None:
+            kept[contact.order] = own
+    return memory._replace(anchors=tuple(found))
+
+
+def contacts_of(contact: Contact, points: ContactPoints, slides: Slides, x: np.ndarray) -> Contacts:
+    """Return where a body touches at rows ``x`` (n, 3) at the end of the last time step."""
+    numbers, values = np.empty((len(points.area), 3), dtype=np.int64), np.empty((len(points.area), 8))
+    count = touching(points, slides, x, slides.before, numbers, values)
+    numbers, values = numbers[:count], values[:count]
+    names = tuple(each.name or f"obstacle {k + 1}" for k, each in enumerate(contact.obstacles))
+    return Contacts(
+        obstacles=names,
+        obstacle=numbers[:, 0],
+        point=values[:, :3],
+        gap=values[:, 3],
+        force=values[:, 4:7],
+        pressing=values[:, 7],
+        sliding=numbers[:, 2] > 0,
+        self_force=0.0,
+        mesh_force=np.zeros((len(names), 3)),
+        smallest_gap=float(values[:, 3].min(initial=np.inf)),
+    )

@@ -1,7 +1,7 @@
 """Newton's method for bodies of beams, compiled: equations are linearised, factorised and solved for one time step.
 
 `solve` takes whole steps and keeps its factor while it converges fast. `approach` shortens steps and divides the way to
-the target into increments, as `Statics` does.
+the target into increments, as `Statics` does. `solve_in_contact` takes steps as far as no point enters an obstacle.
 """
 
 from __future__ import annotations
@@ -11,7 +11,14 @@ from typing import NamedTuple
 import numpy as np
 
 from softgym_envs.mechanics.compilation import FAST, njit
-from softgym_envs.mechanics.solvers.beam_equations import assemble, move
+from softgym_envs.mechanics.solvers.beam_body import BeamBody
+from softgym_envs.mechanics.solvers.beam_contact import free_part, has_failed, slide
+from softgym_envs.mechanics.solvers.beam_equations import (
+    Equations,
+    assemble,
+    make_equations,
+)
+from softgym_envs.mechanics.solvers.beam_frames import move
 from softgym_envs.mechanics.solvers.block_cholesky import SIZE, factorise, solve_lower, solve_upper
 from softgym_envs.mechanics.solvers.complementarity import solve_row
 from softgym_envs.mechanics.solvers.equilibrium import CAUTIOUS
@@ -29,6 +36,11 @@ LONG, LONG_IN_TIME, TOO_LONG = 0.01, 0.002, 1.0
 REMAINING, SMALLEST = 0.01, 1e-13
 """A solution is found when the next step will be shorter than this part of the tolerance, or than this length [m],
 which is near rounding. Errors of a time step act on the next one through the velocities."""
+MAX_CONTACT, WHOLE, LONGEST = 30, 1, 0.3
+"""With contact: the largest number of Newton iterations; that of whole ones, before the forces along steps are looked
+at; the longest step, as the largest turn of a frame [rad]."""
+MAX_TRIALS, BALANCED = 12, 0.3
+"""The largest number of parts of a step that are tried, and the part of the forces along it that may be left."""
 
 
 class Factor(NamedTuple):
@@ -36,6 +48,8 @@ class Factor(NamedTuple):
 
     Attributes:
         half: ``L^-1 H``, shape (size, b, 6).
+        drive: the same as efforts act while points slide, shape (size, b, 6); ``half`` itself for bodies that touch
+            nothing.
         compliance: ``W``, shape (size, size).
         driven: inverse of its part of the driven rows, shape (d, d).
         signs: of the pivots, shape (b, 6).
@@ -45,6 +59,7 @@ class Factor(NamedTuple):
     """
 
     half: np.ndarray
+    drive: np.ndarray
     compliance: np.ndarray
     driven: np.ndarray
     signs: np.ndarray
@@ -53,10 +68,35 @@ class Factor(NamedTuple):
     turned: np.ndarray
 
 
-def make_factor(blocks: int, size: int) -> Factor:
-    """Return arrays for a body with ``blocks`` movable frames and ``size`` constraint rows."""
-    return Factor(
-        half=np.zeros((size, blocks, SIZE)),
+class System(NamedTuple):
+    """A body with its equations and their factor."""
+
+    body: BeamBody
+    equations: Equations
+    factor: Factor
+
+
+class Drive(NamedTuple):
+    """How constraint rows are commanded.
+
+    Attributes:
+        driven: rows whose values are commanded, shape (d,).
+        forced: rows whose efforts are commanded, shape (f,).
+        one_way: which of the driven rows cannot push, shape (d,).
+    """
+
+    driven: np.ndarray
+    forced: np.ndarray
+    one_way: np.ndarray
+
+
+def make_system(body: BeamBody, size: int) -> System:
+    """Return a body with ``size`` constraint rows and arrays for its equations."""
+    blocks = len(body.components.free)
+    half = np.zeros((size, blocks, SIZE))
+    factor = Factor(
+        half=half,
+        drive=half if body.contact is None else np.zeros_like(half),
         compliance=np.zeros((size, size)),
         driven=np.zeros((size, size)),
         signs=np.ones((blocks, SIZE)),
@@ -64,6 +104,7 @@ def make_factor(blocks: int, size: int) -> Factor:
         efforts=np.zeros(size),
         turned=np.zeros((3, 3)),
     )
+    return System(body, make_equations(body, size), factor)
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
@@ -77,11 +118,12 @@ def _dot(a, b, signs):
 
 
 @njit(cache=True, error_model="numpy")
-def factorise_tangent(body, equations, factor, rows):
+def factorise_tangent(system, rows):
     """Factorise the tangent and fill ``half`` and ``W`` of constraint rows; the number of its negative eigenvalues.
 
-    Returns -1 if there is no factor.
+    Returns -1 if there is no factor. The eigenvalues are those of the symmetric part.
     """
+    body, equations, factor = system
     negative = factorise(equations.tangent, body.pattern.pointers, body.pattern.targets, factor.signs)
     if negative < 0:
         return -1
@@ -93,7 +135,33 @@ def factorise_tangent(body, equations, factor, rows):
             value = _dot(half, factor.half[rows[j]], factor.signs)
             factor.compliance[rows[i], rows[j]] = value
             factor.compliance[rows[j], rows[i]] = value
+    _factorise_slides(equations.slides, body.pattern, equations.tangent, factor, rows)
     return negative
+
+
+@njit(cache=True, error_model="numpy")
+def _factorise_slides(slides, pattern, tangent, factor, rows):
+    """Let sliding points change what follows from a factor of the symmetric part of the tangent."""
+    if slides is None:
+        return
+    count, signs = slides.number[0], factor.signs
+    for s in range(count):
+        solve_lower(tangent, pattern.pointers, pattern.columns, slides.direction[s])
+        solve_lower(tangent, pattern.pointers, pattern.columns, slides.loading[s])
+    if count > 0:
+        core = np.eye(count)
+        for s in range(count):
+            for t in range(count):
+                core[s, t] += _dot(slides.loading[s], slides.direction[t], signs)
+        slides.core[:count, :count] = np.linalg.inv(core)
+    for i in range(rows.shape[0]):
+        drive = factor.drive[rows[i]]
+        drive[:] = factor.half[rows[i]]
+        slide(slides, drive, signs)
+    if count > 0:
+        for i in range(rows.shape[0]):
+            for j in range(rows.shape[0]):
+                factor.compliance[rows[i], rows[j]] = _dot(factor.half[rows[i]], factor.drive[rows[j]], signs)
 
 
 @njit(cache=True, error_model="numpy")
@@ -108,14 +176,17 @@ def invert_driven(factor, driven):
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
-def _correct(body, equations, factor, effort, target, driven, forced, one_way):
+def _correct(system, effort, target, drive):
     """Solve the linearised equations for the steps of the motions and of the efforts, as `Statics` does.
 
     Returns the largest displacement of the step; NaN if no set of taut actuators is consistent.
     """
+    body, equations, factor = system
+    driven, forced, one_way = drive
     step, change, W = factor.step, factor.efforts, factor.compliance
     step[:] = equations.residual
     solve_lower(equations.tangent, body.pattern.pointers, body.pattern.columns, step)
+    slide(equations.slides, step, factor.signs)
     for i in range(forced.shape[0]):
         change[forced[i]] = target[forced[i]] - effort[forced[i]]
     count = driven.shape[0]
@@ -148,9 +219,9 @@ def _correct(body, equations, factor, effort, target, driven, forced, one_way):
         flat[i] *= -signs[i]
     for c in range(change.shape[0]):
         if change[c] != 0.0:
-            half = factor.half[c].reshape(size)
+            along = factor.drive[c].reshape(size)
             for i in range(flat.shape[0]):
-                flat[i] += change[c] * signs[i] * half[i]
+                flat[i] += change[c] * signs[i] * along[i]
     solve_upper(equations.tangent, body.pattern.pointers, body.pattern.columns, step)
     largest = 0.0
     for i in range(flat.shape[0]):
@@ -161,30 +232,33 @@ def _correct(body, equations, factor, effort, target, driven, forced, one_way):
 
 
 @njit(cache=True, error_model="numpy")
-def _linearise(body, x, effort, step, equations, factor, driven, rows, one_way, definite):
+def _linearise(system, x, effort, step, drive, rows, definite):
     """Assemble and factorise at rows ``x``; the number of negative eigenvalues, or -1 if there is no factor.
 
     Only positive definite tangents count if ``definite``, or if there are ``one_way`` rows, whose complementarity needs
     them.
     """
-    assemble(body, x, effort, step, equations, True)
-    negative = factorise_tangent(body, equations, factor, rows)
-    if negative < 0 or (negative and (definite or one_way.any())):
+    assemble(system.body, x, effort, step, system.equations, True)
+    if has_failed(system.equations.slides):
         return -1
-    if not one_way.any():
-        invert_driven(factor, driven)
+    negative, one_way = factorise_tangent(system, rows), drive.one_way.any()
+    if negative < 0 or (negative and (definite or one_way)):
+        return -1
+    if not one_way:
+        invert_driven(system.factor, drive.driven)
     return negative
 
 
 @njit(cache=True, error_model="numpy")
-def solve(body, x, effort, target, driven, forced, one_way, step, equations, factor, tolerance, fresh):
+def solve(system, x, effort, target, drive, step, tolerance, fresh):
     """Solve the equations in place, starting at the predicted rows ``x``; the iterations, or -1 on failure.
 
     It starts with the factor of the last solution unless ``fresh``. It fails where a step with a new factor is longer
     than the last of them, and in dynamics where the first step with a factor is not followed by a shorter one: such
-    steps are too long. ``one_way`` (d,) are driven rows that cannot push.
+    steps are too long.
     """
-    rows = np.concatenate((driven, forced))
+    body, equations, factor = system
+    rows = np.concatenate((drive.driven, drive.forced))
     static = step.h == np.inf
     before = last = np.inf
     taken = 0  # with the present factor, in this solution
@@ -194,11 +268,11 @@ def solve(body, x, effort, target, driven, forced, one_way, step, equations, fac
     for iteration in range(1, MAX_ITERATIONS + 1):
         if not fresh:
             assemble(body, x, effort, step, equations, False)
-        elif _linearise(body, x, effort, step, equations, factor, driven, rows, one_way, static) < 0:
+        elif _linearise(system, x, effort, step, drive, rows, static) < 0:
             return -1
         else:
             taken = 0
-        length = _correct(body, equations, factor, effort, target, driven, forced, one_way)
+        length = _correct(system, effort, target, drive)
         if not length <= TOO_LONG * radian:  # also true for NaN
             return -1
         ratio = length / before if iteration > 1 else 1.0
@@ -229,15 +303,16 @@ def solve(body, x, effort, target, driven, forced, one_way, step, equations, fac
 
 
 @njit(cache=True, error_model="numpy")
-def _search(body, x, effort, target, driven, forced, one_way, step, equations, factor, tolerance, definite):
+def _search(system, x, effort, target, drive, step, tolerance, definite):
     """Do in place what `Statics` does at one load level; the iterations, or -1 on failure.
 
     Steps are shortened until the next one with the same factor would be shorter. The equations are linearised at rows
     ``x``, and at those of the solution on success.
     """
-    rows = np.concatenate((driven, forced))
+    body, equations, factor = system
+    rows = np.concatenate((drive.driven, drive.forced))
     begin, begin_effort, stride, pull = x.copy(), effort.copy(), factor.step.copy(), factor.efforts.copy()
-    norm = _correct(body, equations, factor, effort, target, driven, forced, one_way)
+    norm = _correct(system, effort, target, drive)
     part = 1.0
     for iteration in range(1, MAX_SEARCHES + 1):
         if not np.isfinite(norm):
@@ -255,7 +330,7 @@ def _search(body, x, effort, target, driven, forced, one_way, step, equations, f
             for c in range(effort.shape[0]):
                 effort[c] = begin_effort[c] + part * pull[c]
             assemble(body, x, effort, step, equations, False)
-            remaining = _correct(body, equations, factor, effort, target, driven, forced, one_way)
+            remaining = _correct(system, effort, target, drive)
             if remaining <= (1.0 - 0.25 * part) * norm or remaining <= tolerance:
                 break
             part *= 0.5
@@ -265,9 +340,9 @@ def _search(body, x, effort, target, driven, forced, one_way, step, equations, f
             move(body.frames, x, factor.step, factor.turned)
             for c in range(effort.shape[0]):
                 effort[c] += factor.efforts[c]
-        if _linearise(body, x, effort, step, equations, factor, driven, rows, one_way, definite) < 0:
+        if _linearise(system, x, effort, step, drive, rows, definite) < 0:
             return -1
-        norm = _correct(body, equations, factor, effort, target, driven, forced, one_way)
+        norm = _correct(system, effort, target, drive)
         if part == 1.0 and norm <= tolerance:
             return iteration
         part = min(1.0, 2.0 * part)
@@ -275,10 +350,12 @@ def _search(body, x, effort, target, driven, forced, one_way, step, equations, f
 
 
 @njit(cache=True, error_model="numpy")
-def approach(body, x, effort, target, driven, forced, one_way, step, equations, factor, tolerance):
+def approach(system, x, effort, target, drive, step, tolerance):
     """Solve the equations in place in increments, as `Statics` does; the iterations, or -1 on failure."""
-    rows = np.concatenate((driven, forced))
-    negative = _linearise(body, x, effort, step, equations, factor, driven, rows, one_way, False)
+    body, equations, factor = system
+    driven = drive.driven
+    rows = np.concatenate((driven, drive.forced))
+    negative = _linearise(system, x, effort, step, drive, rows, False)
     if negative < 0:
         return -1
     held = driven.shape[0] == body.servos.number.shape[0] + body.chambers.number.shape[0]
@@ -294,14 +371,14 @@ def approach(body, x, effort, target, driven, forced, one_way, step, equations, 
         kept[:] = x
         kept_effort[:] = effort
         definite = held and level - done > CAUTIOUS and negative == 0
-        found = _search(body, x, effort, goal, driven, forced, one_way, step, equations, factor, tolerance, definite)
+        found = _search(system, x, effort, goal, drive, step, tolerance, definite)
         if found < 0:
             x[:] = kept
             effort[:] = kept_effort
             size = 0.5 * (level - done)
             if size < SMALLEST_INCREMENT:
                 return -1
-            negative = _linearise(body, x, effort, step, equations, factor, driven, rows, one_way, False)
+            negative = _linearise(system, x, effort, step, drive, rows, False)
             if negative < 0:
                 return -1
             continue
@@ -313,3 +390,96 @@ def approach(body, x, effort, target, driven, forced, one_way, step, equations, 
         done = level
         size *= 1.5
     return iterations
+
+
+@njit(cache=True, error_model="numpy")
+def _take(system, kept, x, stride, part):
+    """Move rows ``x`` by a part of a step from those ``kept``."""
+    factor, x[:] = system.factor, kept
+    for k in range(stride.shape[0]):
+        for i in range(SIZE):
+            factor.step[k, i] = part * stride[k, i]
+    move(system.body.frames, x, factor.step, factor.turned)
+
+
+@njit(cache=True, error_model="numpy")
+def _part_of_step(system, kept, x, stride, effort, step, most, start):
+    """Return the part of a step, up to ``most``, at which the forces along it vanish; rows ``x`` are moved by it.
+
+    ``start`` < 0 are the forces along the step at its start with the efforts (size,) at its end. Where a point passes
+    from sliding one way over sticking to sliding the other way, they change nearly at once, and whole steps would go
+    to and fro for ever.
+    """
+    body, equations, _ = system
+    ones = np.ones_like(stride)
+    low, high, part, below, above = 0.0, most, most, start, np.inf
+    for trial in range(MAX_TRIALS):
+        _take(system, kept, x, stride, part)
+        assemble(body, x, effort, step, equations, False)
+        along = np.inf if has_failed(equations.slides) else _dot(equations.residual, stride, ones)
+        if abs(along) <= BALANCED * abs(start) or (trial == 0 and along < 0.0):
+            break
+        if along > 0.0:
+            high, above, below = part, along, (0.5 * below if above < np.inf else below)
+        else:
+            low, below, above = part, along, 0.5 * above
+        part = 0.5 * (low + high) if above == np.inf else (low * above - high * below) / (above - below)
+    return part
+
+
+@njit(cache=True, error_model="numpy")
+def solve_in_contact(system, x, effort, target, drive, step, tolerance, fresh):
+    """Solve the equations of a time step in place as `solve` does, where points may touch; the iterations, or -1.
+
+    Rows ``x`` must lie outside the obstacles. Steps end where points would enter an obstacle and, if they do not soon
+    converge, where the forces along them vanish.
+    """
+    body, equations, factor = system
+    rows = np.concatenate((drive.driven, drive.forced))
+    radian, ones = body.components.scale[:, 3:].max(), np.ones_like(factor.step)
+    before, taken = np.inf, 0
+    enough = min(tolerance, max(REMAINING * tolerance, SMALLEST))
+    stride, kept = factor.step.copy(), x.copy()
+    for iteration in range(1, MAX_CONTACT + 1):
+        if fresh:
+            if _linearise(system, x, effort, step, drive, rows, False) < 0:
+                return -1
+            taken = 0
+        else:
+            number = equations.slides.number[0]  # that of the factor, which stays as it is
+            assemble(body, x, effort, step, equations, False)
+            if has_failed(equations.slides):
+                return -1
+            equations.slides.number[0] = number
+        length = _correct(system, effort, target, drive)
+        if not length < np.inf:  # also true for NaN
+            return -1
+        ratio = length / before if before < np.inf else 1.0
+        if not fresh and (ratio > SLOW if iteration > 1 else length > LONG_IN_TIME * radian):
+            fresh = True  # this step is not taken
+            continue
+        start = 0.0
+        if fresh and iteration > WHOLE and length > LONG_IN_TIME * radian:
+            start = _dot(equations.residual, factor.step, ones)
+            for c in range(effort.shape[0]):
+                start -= factor.efforts[c] * _dot(equations.H[c], factor.step, ones)
+        for c in range(effort.shape[0]):
+            effort[c] += factor.efforts[c]
+        stride[:] = factor.step
+        kept[:] = x
+        part, free = min(1.0, LONGEST * radian / length), 0.0
+        while free < 1.0:
+            _take(system, kept, x, stride, part)
+            free = free_part(body.contact, equations.slides, kept, x)
+            part *= free  # the way bends, so it is tested again
+            if part < SHORTEST:
+                return -1
+        if start < 0.0:
+            part = _part_of_step(system, kept, x, stride, effort, step, part, start)
+        taken += 1
+        # After a step with a new factor the next one shrinks by the square of the ratio.
+        if part == 1.0 and (length <= enough or length * ratio * (1.0 if taken == 1 else 2.0) <= enough):
+            return iteration
+        fresh = part < 1.0 or length > LONG_IN_TIME * radian
+        before = length if part == 1.0 else np.inf
+    return -1

@@ -88,6 +88,8 @@ class Dynamics(Statics):
         ValueError: for an unknown scheme, a step that is not positive or a negative damping.
     """
 
+    _moving = True
+
     def __init__(
         self,
         model: MechanicalModel,
@@ -304,12 +306,15 @@ class Dynamics(Statics):
             stiffness_damping=self.stiffness_damping,
             tolerance=self.tolerance,
             cuts=self.max_cuts,
+            memory=None if self.linearisation.contact is None else self.linearisation.contact.memory,
         )
         if not found.taken:
             return 0, None
         self.x, self.velocity, self.effort = found.x, found.velocity, found.effort
         self.linearisation.loads = loads
         self.linearisation.current = False
+        if found.memory is not None:
+            self._remember(found.memory)
         self.time += found.taken * self.step
         self._work += found.work
         self._dissipated += found.dissipated
@@ -323,6 +328,9 @@ class Dynamics(Statics):
             self._layout.slack(found.effort, found.delta, targets[-1], np.flatnonzero(is_driven), self.unilateral),
             stable=found.stable,
             iterations=found.iterations,
+            symmetric=not found.slides,
+            contacts=found.contacts,
+            memory=found.memory,
         )
         potential = found.elastic - float(np.vdot(loads, found.x - self.model.nodes))
         velocity = found.velocity.copy()

@@ -24,6 +24,7 @@ from softgym_envs.mechanics.assembly import Assembled
 from softgym_envs.mechanics.condensation import ContactModel
 from softgym_envs.mechanics.contact.contact import ContactMemory
 from softgym_envs.mechanics.model import MechanicalModel
+from softgym_envs.mechanics.solvers.beam_body import reason_for_general
 from softgym_envs.mechanics.solvers.beam_motion import BeamMotion
 from softgym_envs.mechanics.solvers.cable_friction import CableMemory
 from softgym_envs.mechanics.solvers.complementarity import complementary_step, held_step
@@ -71,6 +72,8 @@ class Statics:
         linearisation: the equations linearised where the last iteration ended.
     """
 
+    _moving = False
+
     def __init__(
         self,
         model: MechanicalModel,
@@ -99,7 +102,8 @@ class Statics:
             raise ValueError("drives with compliance are computed without contact only; allowed: compliance = 0")
         self._elasticity_version = model.elasticity_version
         self._layout, self._shape = RowLayout.of(model), ShapeCheck.of(model)
-        self._compiled, self._lumped = compiled, False
+        self._compiled = self._asked = compiled
+        self._lumped = False
         self._beams: BeamMotion | None = None
         used = np.unique(np.concatenate([block.nodes_used for block in model.blocks]))  # not the directors of frames
         extent = float(np.linalg.norm(np.ptp(model.nodes[used], axis=0)))
@@ -573,9 +577,18 @@ class Statics:
         if not self._compiled or self.model.assembly is not self._assembly:
             return None
         if self._beams is None or self._beams.elasticity_version != self.model.elasticity_version:
-            self._beams = BeamMotion.of(self.model, self._assembly.mass_matrix(self._lumped))
-            self._compiled = self._beams is not None
+            if reason_for_general(self.model, moving=self._moving) is not None:
+                self._compiled = False
+                return None
+            self._beams = BeamMotion(self.model, self._assembly.mass_matrix(self._lumped))
         return self._beams
+
+    @property
+    def not_compiled(self) -> str | None:
+        """Why the general solver computes this body, which takes far longer; None where compiled code does."""
+        if not self._asked:
+            return "compiled code was not asked for, or the scheme is not 'euler'"
+        return reason_for_general(self.model, moving=self._moving)
 
     def _balance(self, goal: np.ndarray, driven: np.ndarray) -> Equilibrium | None:
         """Find the equilibrium for commanded rows (size,) in compiled code; None where the general solver is needed."""

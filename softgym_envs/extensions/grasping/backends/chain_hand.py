@@ -16,7 +16,7 @@ import numpy as np
 from softgym_envs.backends.backend import Backend, State, check_numbers, refuse_force
 from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
-from softgym_envs.extensions.grasping.chain.contact import FOLDED, STICK, STIFFNESS, table_of
+from softgym_envs.extensions.grasping.chain.contact import FOLDED, STICK, STIFFNESS
 from softgym_envs.extensions.grasping.chain.equilibrium import clearances, touching
 from softgym_envs.extensions.grasping.chain.hand import (
     FINGERS,
@@ -37,6 +37,7 @@ from softgym_envs.extensions.grasping.robots.grasping_hands import (
     ContactAidedGripper,
 )
 from softgym_envs.mechanics.condensation import CondensedModel, Row, point_rows
+from softgym_envs.mechanics.contact.compiled import table_of
 from softgym_envs.mechanics.contact.contact import Contacts
 from softgym_envs.mechanics.contact.obstacles import Plane, RoundedPrism
 from softgym_envs.mechanics.contact.surface import surface_of

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from softgym_envs.extensions.grasping.chain.equilibrium import advance, clearances, condense, touching
-from softgym_envs.extensions.grasping.chain.kernels import PARAMETERS, PLANE, PRISM, ROUND
 from softgym_envs.extensions.grasping.chain.model import PreparedChains, carried_points
-from softgym_envs.mechanics.contact.obstacles import Cylinder, Obstacle, Plane, RoundedPrism, Sphere
+from softgym_envs.mechanics.contact.compiled import PARAMETERS, PLANE, table_of
+from softgym_envs.mechanics.contact.obstacles import Cylinder, Obstacle, Plane, RoundedPrism
 
 DISTANCE = 5.0e-4
 """Gap at which contact forces vanish [m]."""
@@ -30,37 +30,6 @@ In finite elements, folds of 0.1 to 0.5 mm more than the distance of contact alr
 
 DEPTH_ROWS = 11
 """Rows of skin points across the thickness where obstacles change along z."""
-
-
-def table_of(obstacles: Sequence[Obstacle]) -> tuple[np.ndarray, np.ndarray]:
-    """Return obstacles as the solver takes them: parameters (O, 17) and edges (O, E, 7).
-
-    Raises:
-        ValueError: for an obstacle on a moving frame or of another kind.
-    """
-    count = max([1, *(len(o.polygon) for o in obstacles if isinstance(o, RoundedPrism))])
-    table, edges = np.zeros((len(obstacles), PARAMETERS)), np.zeros((len(obstacles), count, 7))
-    for row, lines, obstacle in zip(table, edges, obstacles, strict=True):
-        if obstacle.frame is not None:
-            raise ValueError(f"obstacle '{obstacle.name or obstacle.kind}' moves with a frame; chains need fixed ones")
-        matrix = np.zeros((3, 3))
-        row[1] = obstacle.friction
-        if isinstance(obstacle, Plane):
-            row[0], row[5:8], matrix[0] = PLANE, obstacle.point, obstacle.normal
-        elif isinstance(obstacle, Sphere):
-            row[0], row[2], row[5:8], matrix = ROUND, obstacle.radius, obstacle.centre, np.eye(3)
-        elif isinstance(obstacle, Cylinder):
-            row[0], row[2], row[5:8] = ROUND, obstacle.radius, obstacle.point
-            matrix = np.eye(3) - np.outer(obstacle.axis, obstacle.axis)
-        elif isinstance(obstacle, RoundedPrism):
-            row[0], row[2], row[3], row[4] = PRISM, obstacle.radius, obstacle.half_height, len(obstacle.polygon)
-            row[5:8], matrix = obstacle.centre, np.asarray(obstacle.rotation)
-            start, length, direction, outward = obstacle.edges
-            lines[: len(start)] = np.column_stack([start, length, direction, outward])
-        else:
-            raise ValueError(f"chains cannot touch obstacles of kind '{obstacle.kind}'")
-        row[8:17] = np.asarray(matrix).ravel()
-    return table, edges
 
 
 def changes_along_z(obstacle: Obstacle, thickness: float) -> bool:

@@ -13,13 +13,13 @@ from softgym_envs.extensions.grasping.chain.kernels import (
     assemble,
     energy_of,
     factorise,
-    gap_of,
     skin_point,
     substitute,
     touch,
     turns,
 )
 from softgym_envs.mechanics.compilation import njit
+from softgym_envs.mechanics.contact.compiled import gap_of
 
 TOLERANCE = 1e-9
 """A search ends when its last step moves no node further than this [m]."""

@@ -15,14 +15,8 @@ import math
 import numpy as np
 
 from softgym_envs.mechanics.compilation import njit
-from softgym_envs.mechanics.contact.obstacles import prism_geometry
+from softgym_envs.mechanics.contact.compiled import gap_of, make_touch, quick_gap, touch_point
 
-PLANE, ROUND, PRISM = 0, 1, 2
-"""Kinds of obstacles. A row of parameters holds: kind, friction, radius, half height, number of edges, centre (3),
-matrix (9, row by row: the projection of round obstacles, the rotation of prisms, the normal of planes in its first
-row)."""
-
-PARAMETERS = 17
 MAX_STEP = 0.004
 """Largest displacement of a node in one Newton step [m]; half of the thinnest allowed obstacle."""
 MAX_TURN = 0.25
@@ -90,61 +84,6 @@ def segment(a, b, length, along, stiffness, convex, gradient, hessian):
 
 
 @njit(cache=True, error_model="numpy")
-def quick_gap(p, parameters, edges):
-    """Return the gap [m] of a point (3,) to an obstacle, without its derivatives."""
-    kind = int(parameters[0])
-    x, y, z = p[0] - parameters[5], p[1] - parameters[6], p[2] - parameters[7]
-    if kind == PLANE:
-        return parameters[8] * x + parameters[9] * y + parameters[10] * z
-    if kind == ROUND:
-        square = 0.0
-        for i in range(3):
-            square += (parameters[8 + 3 * i] * x + parameters[9 + 3 * i] * y + parameters[10 + 3 * i] * z) ** 2
-        return max(math.sqrt(square), 1e-300) - parameters[2]
-    normal, curvature = np.empty(3), np.empty((3, 3))
-    return gap_of(p, parameters, edges, normal, curvature)
-
-
-@njit(cache=True, error_model="numpy")
-def gap_of(p, parameters, edges, normal, curvature):
-    """Return the gap [m] of a point (3,) to an obstacle; fill its normal (3,) and curvature (3, 3)."""
-    kind = int(parameters[0])
-    matrix = parameters[8:17].reshape(3, 3)
-    if kind == PLANE:
-        gap = 0.0
-        for i in range(3):
-            normal[i] = matrix[0, i]
-            gap += normal[i] * (p[i] - parameters[5 + i])
-            for j in range(3):
-                curvature[i, j] = 0.0
-        return gap
-    if kind == ROUND:
-        x, y, z = p[0] - parameters[5], p[1] - parameters[6], p[2] - parameters[7]
-        square = 0.0
-        for i in range(3):
-            normal[i] = matrix[i, 0] * x + matrix[i, 1] * y + matrix[i, 2] * z
-            square += normal[i] ** 2
-        length = max(math.sqrt(square), 1e-300)
-        for i in range(3):
-            normal[i] /= length
-        for i in range(3):
-            for j in range(3):
-                curvature[i, j] = (matrix[i, j] - normal[i] * normal[j]) / length
-        return length - parameters[2]
-    count = int(parameters[4])
-    local = np.empty((1, 3))
-    local[0] = (p - parameters[5:8]) @ matrix
-    found, n, h = np.empty(1), np.empty((1, 3)), np.empty((1, 3, 3))
-    prism_geometry(
-        local, edges[:count, 0:2], edges[:count, 2], edges[:count, 3:5], edges[:count, 5:7], parameters[3],
-        parameters[2], found, n, h,
-    )  # fmt: skip
-    normal[:] = matrix @ n[0]
-    curvature[:, :] = matrix @ h[0] @ matrix.T
-    return found[0]
-
-
-@njit(cache=True, error_model="numpy")
 def turns(q):
     """Return cosine and sine of the rotations of nodes (N, 3), shape (N, 2)."""
     found = np.empty((len(q), 2))
@@ -207,57 +146,22 @@ def touch(p, area, obstacle, edges, anchor, law, convex, pull, tangent):
         pull: minus the force on the point in the plane, shape (2,), is filled.
         tangent: its derivative by the point, shape (2, 2), is filled.
     """
-    distance, stiffness, stick = law[0], law[1], law[2]
     pull[0] = pull[1] = 0.0
     tangent[0, 0] = tangent[0, 1] = tangent[1, 0] = tangent[1, 1] = 0.0
     gap = quick_gap(p, obstacle, edges)
-    if gap >= distance:
+    if gap >= law[0]:
         return 0.0, gap, 0.0, False
     if not gap > 0.0:
         return np.inf, gap, 0.0, False
-    normal, curvature = np.empty(3), np.empty((3, 3))
-    gap = gap_of(p, obstacle, edges, normal, curvature)
-    s = (gap / distance) ** 2
-    log, rest = math.log(s), s - 1.0
-    by_s = -distance * (2.0 * rest * log + rest * rest / s)
-    by_ss = -distance * (2.0 * log + 4.0 * rest / s - rest * rest / (s * s))
-    slope = 2.0 * gap / distance**2
-    scale = stiffness * area
-    first = scale * by_s * slope
-    second = scale * (by_ss * slope * slope + by_s * 2.0 / distance**2)
+    found = make_touch()
+    energy, rub, _, pressing, sliding = touch_point(p, area, obstacle, edges, anchor, law, convex, found)
     for i in range(2):
-        pull[i] = first * normal[i]
+        pull[i] = found.pull[i]
         for j in range(2):
-            tangent[i, j] = second * normal[i] * normal[j]
-            if not convex:
-                tangent[i, j] += first * curvature[i, j]
-    energy = scale * (-distance * rest * rest * log)
-    sliding = False
-    if obstacle[1] > 0.0:
-        place, unused = np.empty(3), np.empty((3, 3))
-        gap_of(anchor, obstacle, edges, place, unused)
-        stretch = p - anchor
-        along = stretch - place * (place @ stretch)
-        size = math.sqrt(along @ along)
-        spring, limit = stick * area, -obstacle[1] * first
-        sliding = spring * size > limit
-        factor = spring
-        if sliding:
-            factor = limit / size
-        energy += limit * size - 0.5 * limit * limit / spring if sliding else 0.5 * spring * size * size
-        for i in range(2):
-            pull[i] += factor * along[i]
-            for j in range(2):
-                plane = -place[i] * place[j]
-                if i == j:
-                    plane += 1.0
-                value = factor * plane
-                if sliding:
-                    value -= factor * along[i] * along[j] / size**2
-                    if not convex:
-                        value -= obstacle[1] * second * along[i] / size * normal[j]
-                tangent[i, j] += value
-    return energy, gap, -first, sliding
+            tangent[i, j] = found.tangent[i, j]
+            if sliding and not convex:
+                tangent[i, j] += found.direction[i] * found.loading[j]
+    return energy + rub, gap, pressing, sliding
 
 
 @njit(cache=True, error_model="numpy")

@@ -8,8 +8,9 @@ import numpy as np
 
 from softgym_envs.extensions.grasping.chain.contact import ChainBatch
 from softgym_envs.extensions.grasping.chain.equilibrium import drive_direction
-from softgym_envs.extensions.grasping.chain.kernels import assemble, gap_of, skin_point, touch, turns
+from softgym_envs.extensions.grasping.chain.kernels import assemble, skin_point, touch, turns
 from softgym_envs.mechanics.compilation import njit
+from softgym_envs.mechanics.contact.compiled import gap_of
 
 
 class ContactRows(NamedTuple):

@@ -1,0 +1,71 @@
+"""A body that walks: a trunk on four legs of beams, for tests of contact in motion."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from softgym_envs.mechanics.builder import ModelBuilder
+from softgym_envs.mechanics.constraints.chamber import Chamber
+from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
+from softgym_envs.mechanics.constraints.point import Point
+from softgym_envs.mechanics.contact.contact import ContactSettings
+from softgym_envs.mechanics.contact.obstacles import Plane
+from softgym_envs.mechanics.elements.beams import Beam, Section
+from softgym_envs.mechanics.elements.rigid import box_inertia
+from softgym_envs.mechanics.skins import box_skin, tube_skin
+from softgym_envs.mechanics.solvers.dynamics import Dynamics
+
+H = 0.01
+HALF = np.array([0.05, 0.03, 0.008])
+DOWN = np.column_stack([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+RADIUS = 0.008
+
+
+def walker(obstacles, *, elements=2, length=0.05, modulus=6e5, clearance=4e-4, rotation=None, mass=0.05):
+    """A trunk on four legs with two chambers each, which begin at frames that are mounted on the trunk."""
+    rotation = np.eye(3) if rotation is None else rotation
+    builder = ModelBuilder(gravity=(0.0, 0.0, -9.81), floating=True)
+    centre = rotation @ [0.0, 0.0, length + HALF[2] + clearance]
+    trunk = builder.add_frame(centre, rotation)
+    builder.add_mass(trunk, mass, box_inertia(mass, HALF))
+    inertia = math.pi * RADIUS**4 / 4.0
+    section = Section(math.pi * RADIUS**2, (inertia, inertia), 2.0 * inertia, (0.9, 0.9))
+    for x, y in ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)):
+        root = np.array([0.042 * x, 0.025 * y, -HALF[2]])
+        rows = []
+        for k in range(2 * elements + 1):
+            place = centre + rotation @ (root - [0.0, 0.0, length * k / (2 * elements)])
+            rows.append(builder.add_frame(place, rotation @ DOWN, on=trunk if k == 0 else None))
+        builder.add_beam(rows, section=section, young_modulus=modulus, poisson_ratio=0.45, density=1070.0)
+    model = builder.build()
+    angle = 2.0 * np.pi * np.arange(8) / 8
+    outline = RADIUS * np.column_stack([np.cos(angle), np.sin(angle)])
+    for beam in [block for block in model.blocks if isinstance(block, Beam)]:
+        for side in (1.0, -1.0):
+            name = f"chamber {len(model.constraints['a']) + 1}"
+            line = beam.line(range(elements), (0.0045 * side, 0.0), model.nodes)
+            model.add("a", Chamber(name, [line], math.pi * 0.003**2)).unilateral = False
+        model.skins.append(tube_skin(beam, model.nodes, outline))
+    model.skins.append(box_skin(trunk, HALF, model.nodes))
+    model.add("e", Point("trunk", EmbeddedPoints.in_frame(trunk, np.zeros(3), model.nodes)))
+    model.set_contact(obstacles=obstacles, settings=ContactSettings())
+    return model
+
+
+def ground(friction=0.8, normal=(0.0, 0.0, 1.0)):
+    return Plane((0.0, 0.0, 0.0), normal, friction=friction, name="ground")
+
+
+def dynamics(model, **options):
+    return Dynamics(model, **{"step": H, "stiffness_damping": 0.01, "tolerance": 1e-10, **options})
+
+
+def trot(time):
+    """Volumes of the chambers [m3] at a time [s]."""
+    volumes, size = np.empty(8), 3e-8 * min(1.0, time / 0.1)
+    for leg, sign in enumerate((1.0, -1.0, -1.0, 1.0)):
+        swing, lift = math.sin(12.0 * time) * sign, 0.5 * (1.0 + math.cos(12.0 * time) * sign)
+        volumes[2 * leg : 2 * leg + 2] = size * (lift + swing), size * (lift - swing)
+    return volumes
