@@ -173,6 +173,7 @@ def beam(request):
         young_modulus=2.0e5,
         poisson_ratio=0.35,
         density=1000.0,
+        element="linear",
     )
     for name, y, z in (("top", 0.006, 0.017), ("side", 0.018, 0.009)):
         points = np.array([[x, y, z] for x in (0.02, 0.05, 0.09)])

@@ -108,7 +108,7 @@ MISTAKES = {
     "body in micrometres, taken for metres": (lambda _: body(1e6), "*size = 100000 m *; did you mean 0.1 m *um)?*"),
     "body in metres, scaled twice": (lambda _: body(1e-6), "*its size = 1e-07 m *; did you mean 0.1 m (metres, read*"),
     "clamp in millimetres": (
-        lambda _: MechanicalModel.from_mesh(NODES, TETRAHEDRA, fixed=NODES[:, 0] < 1.0),
+        lambda _: MechanicalModel.from_mesh(NODES, TETRAHEDRA, fixed=NODES[:, 0] < 1.0, element="linear"),
         "*every node is clamped, so that nothing can move*",
     ),
     # Actuators and designs

@@ -328,15 +328,15 @@ MISTAKES = {
         "actuator 'cable': the range 0.002 to 0.02 m must contain 0, which is its command at rest",
     ),
     "mask of another mesh": (
-        lambda _: MechanicalModel.from_mesh(NODES, TETRAHEDRA, fixed=np.ones(3, dtype=bool)),
+        lambda _: MechanicalModel.from_mesh(NODES, TETRAHEDRA, fixed=np.ones(3, dtype=bool), element="linear"),
         "'fixed' must be numbers of nodes from 0 to 19, or a mask (20,) or (20, 3), got an array of shape (3,) of bool",
     ),
     "clamped node that does not exist": (
-        lambda _: MechanicalModel.from_mesh(NODES, TETRAHEDRA, fixed=[0, 99]),
+        lambda _: MechanicalModel.from_mesh(NODES, TETRAHEDRA, fixed=[0, 99], element="linear"),
         "'fixed' must be numbers of nodes from 0 to 19, *, got integers of shape (2,) from 0 to 99",
     ),
     "clamped node counted from the end": (
-        lambda _: MechanicalModel.from_mesh(NODES, TETRAHEDRA, fixed=[-1]),
+        lambda _: MechanicalModel.from_mesh(NODES, TETRAHEDRA, fixed=[-1], element="linear"),
         "'fixed' must be numbers of nodes from 0 to 19, *",
     ),
     "two pull points": (
@@ -396,11 +396,11 @@ MISTAKES = {
         "total_mass = -0.1 kg must be positive and finite",
     ),
     "missing file": (
-        lambda f: MechanicalModel.from_file(f / "body.msh", fixed_box=(0, 1, 0, 1, 0, 1)),
+        lambda f: MechanicalModel.from_file(f / "body.msh", fixed_box=(0, 1, 0, 1, 0, 1), element="linear"),
         "mesh file '*body.msh' does not exist",
     ),
     "nothing clamped": (
-        lambda _: MechanicalModel.from_mesh(NODES, TETRAHEDRA, fixed=NODES[:, 0] > 1.0),
+        lambda _: MechanicalModel.from_mesh(NODES, TETRAHEDRA, fixed=NODES[:, 0] > 1.0, element="linear"),
         "no node is fixed: the body could float away; pass the clamped nodes as 'fixed'",
     ),
 }

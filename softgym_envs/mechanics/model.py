@@ -28,6 +28,7 @@ from softgym_envs.mechanics.frames import Frames
 from softgym_envs.mechanics.io import UNITS, read_mesh, read_surface, unit_factor
 from softgym_envs.mechanics.kinematics import Kinematics
 from softgym_envs.mechanics.loads import Load, spread
+from softgym_envs.mechanics.locking import warn_of_locking
 from softgym_envs.mechanics.materials import Material
 from softgym_envs.mechanics.mesh_checks import check_held
 from softgym_envs.mechanics.rods import Rod
@@ -147,7 +148,7 @@ class MechanicalModel:
         tetrahedra: np.ndarray,
         *,
         fixed: Fixed,
-        element: str = "linear",
+        element: str = DEFAULT_ELEMENT,
         material: str | Material = "corotational",
         young_modulus: PerElement = 3.0e6,
         poisson_ratio: PerElement = 0.3,
@@ -162,14 +163,12 @@ class MechanicalModel:
 
         Args:
             nodes: [m], shape (n, 3).
-            tetrahedra: corner indices (m, 4), or with midside nodes (m, 10) for ``"quadratic"``. Midside nodes that
-                are not given are added after the other nodes, fixed where both ends of the edge are.
-            fixed: clamped nodes: indices, a mask (n,), a mask (n, 3) by axis, or a function of the nodes that returns
-                one of them.
-            element: ``"linear"``, ``"averaged"`` (no locking near a Poisson's ratio of 0.5) or ``"quadratic"``.
+            tetrahedra: corner indices (m, 4), or with midside nodes (m, 10) for ``"quadratic"``. Otherwise these are
+                added after the other nodes, fixed where both ends of the edge are.
+            fixed: clamped nodes: indices, a mask (n,) or (n, 3) by axis, or a function of the nodes to one of them.
+            element: ``"quadratic"``, or coarser ones that lock, with a warning how much: ``"linear"``, ``"averaged"``.
             material: a `Material` or its name.
-            young_modulus: [Pa]; one number, an array (m,), a mapping of region names to numbers, or a function of the
-                elements' centroids [m] (m, 3).
+            young_modulus: [Pa]; a number, an array (m,), numbers by region, or a function of centroids [m] (m, 3).
             poisson_ratio: inside (-1, 0.5), in the same forms.
             density: [kg/m3].
             total_mass: mass of the body [kg], instead of the density.
@@ -199,6 +198,7 @@ class MechanicalModel:
         block = part.kind(part.nodes, part.connectivity, **part.options)
         model = cls(part.nodes, [block], fixed=part.fixed, gravity=gravity, solver=solver)
         model._check_held()
+        warn_of_locking(model, element)
         return model
 
     @classmethod

@@ -24,8 +24,8 @@ SOLIDS: dict[str, type[SolidBlock]] = {
 }
 """Solid elements by name."""
 
-DEFAULT_ELEMENT = "linear"
-"""Element of a body, unless another one is asked for."""
+DEFAULT_ELEMENT = "quadratic"
+"""Element of a mesh of one's own, unless another one is asked for: right in thin walls and near a ratio of 0.5."""
 
 PerElement = float | np.ndarray | Mapping[str, float] | Callable[[np.ndarray], np.ndarray]
 """A value for all elements, one for each (m,), one for each region by name, or a function of the centroids (m, 3)."""

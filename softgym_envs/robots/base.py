@@ -522,9 +522,11 @@ class MeshedRobot(Robot):
             fixed: clamped nodes of the mesh, boolean, shape (n,).
             density: [kg/m3]; the default is that of silicone.
         """
-        from softgym_envs.mechanics.model import MechanicalModel
+        from softgym_envs.mechanics.builder import ModelBuilder
 
-        return MechanicalModel.from_mesh(
+        # Published scenes have linear elements, which lock: from_mesh would warn of them.
+        builder = ModelBuilder(gravity=self.gravity)
+        builder.add_solid(
             mesh.nodes,
             mesh.tetrahedra,
             fixed=fixed,
@@ -533,8 +535,8 @@ class MeshedRobot(Robot):
             young_modulus=design["young_modulus"],
             poisson_ratio=design["poisson_ratio"],
             density=density,
-            gravity=self.gravity,
         )
+        return builder.build()
 
     def reference_nodes(self, mesh: BodyMesh) -> np.ndarray:
         """Positions [m] (n, 3) of the nodes in the reference body if ``mesh`` was moved from it, else in ``mesh``.

@@ -14,6 +14,7 @@ import numpy as np
 
 from softgym_envs.designs import DesignSpace, DesignVariable
 from softgym_envs.errors import unknown_name
+from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.materials import resolve_material
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solids import SOLIDS
@@ -215,7 +216,8 @@ class CableTrunk(Robot):
     def assemble(self, design: Mapping[str, float]) -> MechanicalModel:
         """Clamp the base, thread the cables through their guides, put the effector at the middle of the tip."""
         nodes, tetrahedra = self.mesh(design)
-        model = MechanicalModel.from_mesh(
+        builder = ModelBuilder(gravity=self.gravity)
+        builder.add_solid(
             nodes,
             tetrahedra,
             fixed=nodes[:, 2] == 0.0,
@@ -224,8 +226,8 @@ class CableTrunk(Robot):
             young_modulus=design["young_modulus"],
             poisson_ratio=design["poisson_ratio"],
             density=self.density,
-            gravity=self.gravity,
         )
+        model = builder.build()
         base = design["cable_fraction"] * design["base_half_width"]
         tip = TIP_FRACTION * design["tip_half_width"]
         actuators = iter(self.actuators)

@@ -44,7 +44,7 @@ def test_compliance_of_a_cable_converges_and_that_of_a_point_does_not():
     for radius in (0.0, 4e-3):
         for cells in (2, 4, 8):
             nodes, tetrahedra = box_mesh((0.02, 0.02, 0.02), (cells,) * 3)
-            model = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=nodes[:, 2] == 0.0)
+            model = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=nodes[:, 2] == 0.0, element="linear")
             model.add_cable("cable", [[0.01, 0.01, 0.014]], [0.01, 0.01, 0.05], radius=radius)
             compliance[radius, cells] = float(Statics(model).solve([0.0]).condensed.W.aa[0, 0])
     growth = {

@@ -27,7 +27,12 @@ def arc_and_spring(friction):
     nodes = np.vstack([bar, block])
     fixed = (nodes[:, 2] == 0.0) | (np.arange(len(nodes)) >= len(bar))
     model = MechanicalModel.from_mesh(
-        nodes, np.vstack([tetrahedra, tetrahedra + len(bar)]), fixed=fixed, young_modulus=1e5, poisson_ratio=0.3
+        nodes,
+        np.vstack([tetrahedra, tetrahedra + len(bar)]),
+        fixed=fixed,
+        young_modulus=1e5,
+        poisson_ratio=0.3,
+        element="linear",
     )
     # From the bar's end along +x, a quarter turn to +y, in the plane z = 0.05.
     turns = np.linspace(0.0, ANGLE, GUIDES + 1)

@@ -201,7 +201,9 @@ def test_views_by_role_can_be_copied(batch):
 
 def test_W_prints_with_names_and_units(box):
     nodes, tetrahedra = box((0.1, 0.02, 0.02), (5, 1, 1))
-    model = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=lambda x: x[:, 0] == 0.0, young_modulus=1e6)
+    model = MechanicalModel.from_mesh(
+        nodes, tetrahedra, fixed=lambda x: x[:, 0] == 0.0, young_modulus=1e6, element="linear"
+    )
     model.add_cable("upper", [[0.05, 0.01, 0.018], [0.09, 0.01, 0.018]], [-0.01, 0.01, 0.018])
     model.add_effector("tip", [0.1, 0.01, 0.01])
     condensed = Statics(model).solve([0.002]).condensed

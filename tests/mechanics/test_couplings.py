@@ -135,7 +135,9 @@ def test_the_stiffness_of_bonds_has_no_effect(bonded):
 def test_a_bond_to_a_point_in_space_and_a_gap(box):
     """The free end of a bar is pulled to the anchor and gap of its bond, by Hooke's force."""
     nodes, tetrahedra = box((0.1, 0.01, 0.01), (8, 1, 1))
-    model = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=nodes[:, 0] == 0.0, young_modulus=1e6, poisson_ratio=0.0)
+    model = MechanicalModel.from_mesh(
+        nodes, tetrahedra, fixed=nodes[:, 0] == 0.0, young_modulus=1e6, poisson_ratio=0.0, element="linear"
+    )
     tip = model.embed(np.array([0.1, 0.005, 0.005]))
     model.add("b", Bond("hook", tip, np.array([0.1, 0.005, 0.0]), gap=np.array([0.0, 0.0, 0.01])))
     statics = Statics(model)
@@ -144,7 +146,9 @@ def test_a_bond_to_a_point_in_space_and_a_gap(box):
     np.testing.assert_allclose(tip.positions(found.x)[0], [0.1, 0.005, 0.01], atol=1e-10)
     assert found.effort[2] > 0.0 and found.condensed.roles == ()
     # The same, as the force of a contact.
-    plain = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=nodes[:, 0] == 0.0, young_modulus=1e6, poisson_ratio=0.0)
+    plain = MechanicalModel.from_mesh(
+        nodes, tetrahedra, fixed=nodes[:, 0] == 0.0, young_modulus=1e6, poisson_ratio=0.0, element="linear"
+    )
     plain.add("c", Point("tip", tip))
     driven = Statics(plain).solve([], contact=found.effort)
     np.testing.assert_allclose(driven.x, found.x, rtol=0, atol=1e-9)
@@ -224,7 +228,13 @@ def touched(box):
     """A column with a cable, an effector on top and two contact points on its side."""
     nodes, tetrahedra = box((0.02, 0.02, 0.06), (2, 2, 5), jitter=0.2)
     model = MechanicalModel.from_mesh(
-        nodes, tetrahedra, fixed=nodes[:, 2] < 1e-9, young_modulus=2e5, poisson_ratio=0.45, density=1000.0
+        nodes,
+        tetrahedra,
+        fixed=nodes[:, 2] < 1e-9,
+        young_modulus=2e5,
+        poisson_ratio=0.45,
+        density=1000.0,
+        element="linear",
     )
     model.add_cable("cable", np.array([[0.004, 0.01, 0.02], [0.004, 0.01, 0.055]]), np.array([0.004, 0.01, -0.01]))
     model.add_effector("top", np.array([0.01, 0.01, 0.06]))
@@ -310,6 +320,7 @@ def test_nodes_may_be_held_along_some_axes(box):
         poisson_ratio=0.3,
         density=density,
         gravity=(0.0, 0.0, -gravity),
+        element="linear",
     )
     assert not model.fixed[1:].any() and model.fixed[0]
     x = Statics(model, tolerance=1e-15).solve([]).x
@@ -325,7 +336,9 @@ def test_no_node_needs_to_be_held_along_all_axes(box):
     nodes, tetrahedra = box((0.02, 0.02, 0.04), (2, 2, 4), jitter=0.2)
     held = np.isclose(nodes, 0.0, atol=1e-12)
     held[held.all(axis=1)] = False
-    model = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=held, young_modulus=1e5, poisson_ratio=0.4)
+    model = MechanicalModel.from_mesh(
+        nodes, tetrahedra, fixed=held, young_modulus=1e5, poisson_ratio=0.4, element="linear"
+    )
     assert not model.fixed.any()
     model.nodal_loads[np.isclose(nodes[:, 2], 0.04), 2] = 0.8
     found = Statics(model, tolerance=1e-13).solve([])
@@ -340,7 +353,7 @@ def test_a_body_that_is_not_held_along_an_axis_is_rejected(box):
     held = np.isclose(nodes, 0.0, atol=1e-12)
     held[:, 2] = False
     with pytest.raises(ValueError, match=r"the body is a mechanism: it can slide along \[0.0, 0.0, 1.0\]"):
-        MechanicalModel.from_mesh(nodes, tetrahedra, fixed=held)
+        MechanicalModel.from_mesh(nodes, tetrahedra, fixed=held, element="linear")
 
 
 # -- cavities -------------------------------------------------------------------------------------------------------

@@ -40,7 +40,7 @@ def test_model_from_a_file(tmp_path, mesh_in_millimetres, name, written_as):
     path = tmp_path / name
     mesh_in_millimetres.write(path, file_format=written_as)
     box = (-1e-6, 1e-6, -1, 1, -1, 1)
-    model = MechanicalModel.from_file(path, fixed_box=box, scale=1e-3, density=1000.0)
+    model = MechanicalModel.from_file(path, fixed_box=box, scale=1e-3, density=1000.0, element="linear")
     assert model.volume == pytest.approx(0.1 * 0.02 * 0.02, rel=1e-9)
     assert model.mass == pytest.approx(0.04, rel=1e-9)
     assert len(model.nodes) == 20
@@ -66,7 +66,9 @@ def test_model_from_a_file_of_gmsh(tmp_path, binary):
         gmsh.write(str(tmp_path / "beam.msh"))
     finally:
         gmsh.finalize()
-    model = MechanicalModel.from_file(tmp_path / "beam.msh", fixed_box=(-1e-6, 1e-6, -1, 1, -1, 1), scale=1e-3)
+    model = MechanicalModel.from_file(
+        tmp_path / "beam.msh", fixed_box=(-1e-6, 1e-6, -1, 1, -1, 1), scale=1e-3, element="linear"
+    )
     assert model.volume == pytest.approx(0.1 * 0.02 * 0.02, rel=1e-9)
     assert 4 <= model.fixed.sum() < len(model.nodes)
 
@@ -74,7 +76,7 @@ def test_model_from_a_file_of_gmsh(tmp_path, binary):
 def test_a_box_that_fixes_nothing_is_rejected(tmp_path, mesh_in_millimetres):
     mesh_in_millimetres.write(tmp_path / "beam.vtk")
     with pytest.raises(ValueError, match=r"none lies in fixed_box .* the body spans 0 to 0.1, 0 to 0.02, 0 to"):
-        MechanicalModel.from_file(tmp_path / "beam.vtk", unit="mm", fixed_box=(-9, -8, -1, 1, -1, 1))
+        MechanicalModel.from_file(tmp_path / "beam.vtk", unit="mm", fixed_box=(-9, -8, -1, 1, -1, 1), element="linear")
 
 
 def test_missing_file(tmp_path):
@@ -168,12 +170,12 @@ def test_a_body_in_millimetres_is_rejected(tmp_path, mesh_in_millimetres, box):
     mesh_in_millimetres.write(tmp_path / "beam.vtk")
     message = r"the body measures 100 x 20 x 20 m; its size = 100 m is implausible, .* did you mean 0.1 m \(100 mm\)\? "
     with pytest.raises(ValueError, match=message + r"\(for a file in millimetres pass unit='mm', .*\)"):
-        MechanicalModel.from_file(tmp_path / "beam.vtk", fixed_box=(-1, 1, -1, 30, -1, 30))
+        MechanicalModel.from_file(tmp_path / "beam.vtk", fixed_box=(-1, 1, -1, 30, -1, 30), element="linear")
     nodes, tetrahedra = box((100.0, 20.0, 20.0))
     with pytest.raises(ValueError, match=message + r"\(for nodes in millimetres pass 1e-3 \* nodes\)"):
-        MechanicalModel.from_mesh(nodes, tetrahedra, fixed=lambda x: x[:, 0] < 1e-9)
+        MechanicalModel.from_mesh(nodes, tetrahedra, fixed=lambda x: x[:, 0] < 1e-9, element="linear")
     with unchecked("size"):
-        large = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=lambda x: x[:, 0] < 1e-9)
+        large = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=lambda x: x[:, 0] < 1e-9, element="linear")
     assert large.volume == pytest.approx(4e4)
 
 
@@ -197,7 +199,7 @@ def test_a_body_in_millimetres_is_rejected(tmp_path, mesh_in_millimetres, box):
 )
 def test_points_in_millimetres_are_rejected(box, add, message):
     nodes, tetrahedra = box((0.1, 0.02, 0.02), (5, 1, 1))
-    model = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=lambda x: x[:, 0] == 0.0)
+    model = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=lambda x: x[:, 0] == 0.0, element="linear")
     with pytest.raises(ValueError, match=message):
         add(model)
     assert not model.rows
@@ -235,7 +237,9 @@ def test_modulus_by_region_by_element_and_by_place(halves):
     np.testing.assert_array_equal(np.sort(mesh.regions["stiff"]), np.flatnonzero(centroids[:, 0] < 0.05))
     expected = np.where(centroids[:, 0] < 0.05, 3e6, 1e5)
     for modulus in ({"stiff": 3e6, "soft": 1e5}, expected, lambda c: np.where(c[:, 0] < 0.05, 3e6, 1e5)):
-        model = MechanicalModel.from_file(path, fixed=lambda x: x[:, 0] == 0.0, young_modulus=modulus, poisson_ratio=0)
+        model = MechanicalModel.from_file(
+            path, fixed=lambda x: x[:, 0] == 0.0, young_modulus=modulus, poisson_ratio=0, element="linear"
+        )
         np.testing.assert_allclose(model.solids[0].mu, expected / 2.0)
 
 
@@ -252,7 +256,7 @@ def test_modulus_by_region_by_element_and_by_place(halves):
 )
 def test_malformed_moduli_are_rejected(halves, modulus, message):
     with pytest.raises(ValueError, match=message):
-        MechanicalModel.from_file(halves[0], fixed=lambda x: x[:, 0] == 0.0, young_modulus=modulus)
+        MechanicalModel.from_file(halves[0], fixed=lambda x: x[:, 0] == 0.0, young_modulus=modulus, element="linear")
 
 
 @pytest.mark.parametrize("element", SOLIDS)
@@ -338,7 +342,7 @@ def test_a_finer_mesh_and_an_island_in_the_cavity(tmp_path):
     volume = 60 * 20 * 20e-9 - 30 * 8 * 8e-9 + 10 * 4 * 4e-9
     assert Tetrahedra(mesh.nodes, mesh.tetrahedra).volume == pytest.approx(volume, rel=1e-9)
     with pytest.raises(ValueError, match="a part of .* is not connected to anything that is held"):
-        MechanicalModel.from_mesh(mesh.nodes, mesh.tetrahedra, fixed=lambda x: x[:, 0] < 1e-9)
+        MechanicalModel.from_mesh(mesh.nodes, mesh.tetrahedra, fixed=lambda x: x[:, 0] < 1e-9, element="linear")
 
 
 def test_the_default_mesh_size_is_a_twentieth_of_the_diagonal(tmp_path):
@@ -373,7 +377,7 @@ def test_from_a_surface_to_the_condensed_model(hollow, element):
 
 def test_a_cavity_from_its_surface(hollow):
     nodes, tetrahedra = hollow.mesh.nodes, hollow.mesh.tetrahedra
-    model = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=lambda x: x[:, 0] < 1e-9)
+    model = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=lambda x: x[:, 0] < 1e-9, element="linear")
     found = model.add_cavity("air", inside=[0.03, 0.01, 0.01])
     again = model.add_cavity("same", surface=found.triangles)
     assert again.rest_volume == found.rest_volume
@@ -389,12 +393,14 @@ def test_a_cavity_from_its_surface(hollow):
 
 
 def test_a_point_in_the_material_or_outside_is_in_no_cavity(hollow, box):
-    model = MechanicalModel.from_mesh(hollow.mesh.nodes, hollow.mesh.tetrahedra, fixed=lambda x: x[:, 0] < 1e-9)
+    model = MechanicalModel.from_mesh(
+        hollow.mesh.nodes, hollow.mesh.tetrahedra, fixed=lambda x: x[:, 0] < 1e-9, element="linear"
+    )
     for point in ([0.01, 0.01, 0.01], [0.03, 0.01, 0.03]):
         with pytest.raises(ValueError, match=r"no closed cavity .* for 'air'; its cavities lie around \[\[0.03"):
             model.add_cavity("air", inside=point)
     nodes, tetrahedra = box((0.1, 0.02, 0.02))
-    solid = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=lambda x: x[:, 0] < 1e-9)
+    solid = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=lambda x: x[:, 0] < 1e-9, element="linear")
     with pytest.raises(ValueError, match="it has none, or they are open to the outside"):
         solid.add_cavity("air", inside=[0.05, 0.01, 0.01])
 

@@ -139,7 +139,9 @@ def test_elasticity_may_differ_per_element_and_change(box):
 def test_weight_is_density_times_volume_times_gravity(box):
     nodes, tetrahedra = box((0.3, 0.2, 0.1), (3, 2, 2), 0.2)
     gravity = np.array([1.0, 2.0, -9.81])
-    model = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=nodes[:, 0] < 1e-9, density=1234.0, gravity=gravity)
+    model = MechanicalModel.from_mesh(
+        nodes, tetrahedra, fixed=nodes[:, 0] < 1e-9, density=1234.0, gravity=gravity, element="linear"
+    )
     assert model.volume == pytest.approx(0.3 * 0.2 * 0.1, rel=1e-12)
     assert model.mass == pytest.approx(1234.0 * 0.006, rel=1e-12)
     np.testing.assert_allclose(model.loads.sum(axis=0), 1234.0 * 0.006 * gravity, rtol=1e-12)
@@ -181,7 +183,9 @@ def test_patch_of_irregular_elements_reproduces_a_linear_field(box, rng, name):
     assert (~boundary).sum() == 12
     F = np.array([[1.2, 0.3, -0.1], [0.05, 0.9, 0.2], [-0.15, 0.1, 1.1]])
     exact = nodes @ F.T + [0.01, -0.02, 0.03]
-    model = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=boundary, material=name, poisson_ratio=0.4)
+    model = MechanicalModel.from_mesh(
+        nodes, tetrahedra, fixed=boundary, material=name, poisson_ratio=0.4, element="linear"
+    )
     statics = Statics(model, tolerance=1e-14)
     start = exact.copy()
     start[~boundary] += 1e-3 * rng.standard_normal((12, 3))
@@ -198,7 +202,9 @@ def test_negatively_oriented_elements_are_reoriented(box):
     nodes, tetrahedra = box((1, 1, 1), (2, 2, 2))
     mirrored = tetrahedra.copy()
     mirrored[::3] = mirrored[::3][:, [1, 0, 2, 3]]
-    plain, turned = (MechanicalModel.from_mesh(nodes, t, fixed=nodes[:, 0] < 1e-9) for t in (tetrahedra, mirrored))
+    plain, turned = (
+        MechanicalModel.from_mesh(nodes, t, fixed=nodes[:, 0] < 1e-9, element="linear") for t in (tetrahedra, mirrored)
+    )
     assert turned.volume == pytest.approx(1.0, rel=1e-12)
     corners = nodes[turned.blocks[0].connectivity]
     assert (np.linalg.det(corners[:, 1:] - corners[:, :1]) > 0.0).all()
@@ -212,7 +218,9 @@ def test_isolated_nodes_are_held_and_have_no_effect(box):
     fixed = np.flatnonzero(nodes[:, 0] == 0.0)
     states = []
     for points, connectivity, clamp in ((nodes, tetrahedra, fixed), (extra, tetrahedra + 1, fixed + 1)):
-        model = MechanicalModel.from_mesh(points, connectivity, fixed=clamp, young_modulus=1e6, gravity=(0, 0, -9.81))
+        model = MechanicalModel.from_mesh(
+            points, connectivity, fixed=clamp, young_modulus=1e6, gravity=(0, 0, -9.81), element="linear"
+        )
         states.append(Statics(model).solve(np.zeros(0)).x)
     np.testing.assert_allclose(states[1][1:-1], states[0], atol=1e-12)
     np.testing.assert_array_equal(states[1][[0, -1]], extra[[0, -1]])
@@ -222,7 +230,8 @@ def test_mask_and_indices_of_fixed_nodes_are_the_same(box):
     nodes, tetrahedra = box()
     mask = nodes[:, 0] == 0.0
     by_mask, by_index = (
-        MechanicalModel.from_mesh(nodes, tetrahedra, fixed=f) for f in (mask, np.flatnonzero(mask).tolist())
+        MechanicalModel.from_mesh(nodes, tetrahedra, fixed=f, element="linear")
+        for f in (mask, np.flatnonzero(mask).tolist())
     )
     np.testing.assert_array_equal(by_mask.kinematics.free_dofs, by_index.kinematics.free_dofs)
 
@@ -272,7 +281,7 @@ def test_malformed_meshes_are_rejected(change, message):
 @pytest.mark.parametrize("fixed", [[7], [True, False], [0.5]], ids=["out of range", "short mask", "not an index"])
 def test_malformed_fixed_nodes_are_rejected(fixed):
     with pytest.raises((ValueError, IndexError)):
-        MechanicalModel.from_mesh(ONE_TETRAHEDRON, np.array([[0, 1, 2, 3]]), fixed=fixed)
+        MechanicalModel.from_mesh(ONE_TETRAHEDRON, np.array([[0, 1, 2, 3]]), fixed=fixed, element="linear")
 
 
 def test_unknown_role_is_rejected(beam):

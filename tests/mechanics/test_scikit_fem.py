@@ -52,7 +52,7 @@ def test_compliance_at_rest_is_that_of_linear_elasticity(box):
     """W of effectors at rest equals the linear compliance on the same mesh, to round-off."""
     nodes, tetrahedra = box(SIZE, (8, 2, 2), jitter=0.25)
     model = MechanicalModel.from_mesh(
-        nodes, tetrahedra, fixed=nodes[:, 0] == 0.0, young_modulus=YOUNG, poisson_ratio=POISSON
+        nodes, tetrahedra, fixed=nodes[:, 0] == 0.0, young_modulus=YOUNG, poisson_ratio=POISSON, element="linear"
     )
     tip = int(np.argmax(nodes.sum(axis=1)))  # a corner of the free end
     middle = int(np.argmin(np.abs(nodes - np.array(SIZE) * [0.5, 0.0, 1.0]).sum(axis=1)))
@@ -101,6 +101,7 @@ def test_refinement_converges_to_quadratic_elements(box):
             poisson_ratio=POISSON,
             density=density,
             gravity=(0.0, 0.0, -gravity),
+            element="linear",
         )
         x = Statics(model, tolerance=1e-14).solve(np.zeros(0)).x
         deflection = (x - nodes)[np.isclose(nodes[:, 0], SIZE[0]), 2].mean()
@@ -212,6 +213,7 @@ def test_large_deflection_under_weight(box, name, law):
         poisson_ratio=POISSON,
         density=density,
         gravity=gravity,
+        element="linear",
     )
     x = Statics(model).solve(np.zeros(0)).x
     basis = basis_of(nodes, tetrahedra, skfem.ElementTetP1(), 1)

@@ -24,7 +24,7 @@ def hollow(box):
         away = np.abs(nodes[tetrahedra].mean(axis=1) - MIDDLE).max(axis=1)
         shell = tetrahedra[away > SIDE / 6]
         model = MechanicalModel.from_mesh(
-            nodes, shell, fixed=nodes[:, 2] < 1e-9, young_modulus=young_modulus, poisson_ratio=0.3
+            nodes, shell, fixed=nodes[:, 2] < 1e-9, young_modulus=young_modulus, poisson_ratio=0.3, element="linear"
         )
         surface = cavity_around(model.nodes, model.solids[0].corners, MIDDLE, "hole")
         model.add_effector("top", [0.5 * SIDE, 0.5 * SIDE, SIDE])

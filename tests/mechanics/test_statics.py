@@ -68,7 +68,9 @@ def test_a_buckled_column_is_factorised_without_lu(notched, monkeypatch):
     """Free to move sideways, the compressed beam would buckle in both directions; its driven tip does not let it."""
 
     def press(solver):
-        model = MechanicalModel.from_mesh(notched.nodes, notched.tetrahedra, fixed=notched.fixed, solver=solver)
+        model = MechanicalModel.from_mesh(
+            notched.nodes, notched.tetrahedra, fixed=notched.fixed, solver=solver, element="linear"
+        )
         tip = np.array([0.1, 0.01, 0.01])
         model.add_contact("tip", tip)
         return Statics(model).solve([], contact=tip - [0.002, 0.0, 0.0], contact_mode="displacement")
@@ -145,7 +147,7 @@ def test_pulling_bends_towards_the_cable_and_keeps_the_clamp(finger):
 
 def test_without_actuators_only_loads_act(box):
     nodes, tetrahedra = box((0.1, 0.02, 0.02), (4, 1, 1))
-    model = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=nodes[:, 0] == 0.0, young_modulus=1e6)
+    model = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=nodes[:, 0] == 0.0, young_modulus=1e6, element="linear")
     found = Statics(model).solve([])
     np.testing.assert_allclose(found.x, nodes, atol=1e-15)
     model.nodal_loads[-1, 2] = -0.5
@@ -313,7 +315,9 @@ def test_a_part_without_a_fixed_node_is_an_error(box):
     nodes, tetrahedra = box()
     both = np.vstack([nodes, nodes + 5.0])
     with pytest.raises((ConvergenceError, ValueError)):
-        model = MechanicalModel.from_mesh(both, np.vstack([tetrahedra, tetrahedra + len(nodes)]), fixed=[0, 1, 3, 9])
+        model = MechanicalModel.from_mesh(
+            both, np.vstack([tetrahedra, tetrahedra + len(nodes)]), fixed=[0, 1, 3, 9], element="linear"
+        )
         Statics(model).solve([])
 
 
@@ -401,7 +405,13 @@ def test_at_rest_no_cable_is_slack(fingers):
 def test_a_column_beyond_its_buckling_load_is_not_stable(box, solver):
     nodes, tetrahedra = box((0.1, 0.01, 0.01), (10, 2, 2))
     model = MechanicalModel.from_mesh(
-        nodes, tetrahedra, fixed=nodes[:, 0] < 1e-9, young_modulus=1e6, poisson_ratio=0.3, solver=solver
+        nodes,
+        tetrahedra,
+        fixed=nodes[:, 0] < 1e-9,
+        young_modulus=1e6,
+        poisson_ratio=0.3,
+        solver=solver,
+        element="linear",
     )
     line = np.column_stack([np.linspace(0.01, 0.1, 10), np.full(10, 0.005), np.full(10, 0.005)])
     # Straight from the clamp, through the axis: its tension compresses the column.
@@ -450,7 +460,9 @@ def test_a_large_increment_is_divided_where_a_tangent_is_indefinite(monkeypatch)
 
 @pytest.mark.parametrize("solver", ["cholmod", "superlu"])
 def test_short_increments_pass_over_indefinite_tangents(notched, solver):
-    model = MechanicalModel.from_mesh(notched.nodes, notched.tetrahedra, fixed=notched.fixed, solver=solver)
+    model = MechanicalModel.from_mesh(
+        notched.nodes, notched.tetrahedra, fixed=notched.fixed, solver=solver, element="linear"
+    )
     tip = np.array([0.1, 0.01, 0.01])
     model.add_contact("tip", tip)
     # Its driven tip does not let the compressed beam buckle, so there is no way around indefinite tangents.

@@ -37,7 +37,9 @@ class Spike(Robot):
             raise InfeasibleDesign("the spike breaks")
         nodes = CORNERS * [1.0, 1.0, design["length"]]
         fixed = np.array([True, True, True, False])
-        model = MechanicalModel.from_mesh(nodes, np.array([[0, 1, 2, 3]]), fixed=fixed, young_modulus=1e5)
+        model = MechanicalModel.from_mesh(
+            nodes, np.array([[0, 1, 2, 3]]), fixed=fixed, young_modulus=1e5, element="linear"
+        )
         model.add_cable("cable", nodes[3:], pull_point=np.array([0.02, 0.0, 0.0]))
         model.add_effector("tip", nodes[3])
         return model

@@ -271,6 +271,7 @@ def test_rotate_is_the_model_of_the_rotated_mesh(contact_finger):
         material=robot.material,
         young_modulus=design["young_modulus"],
         poisson_ratio=design["poisson_ratio"],
+        element="linear",
     )
     for cable in model.constraints["a"]:
         turned.add_cable(
