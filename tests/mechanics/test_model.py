@@ -109,7 +109,7 @@ def test_two_blocks_of_one_material_equal_one(box):
     nodes, tetrahedra = box((1, 1, 1), (2, 2, 2), 0.2)
     options = {"young_modulus": 1e5, "poisson_ratio": 0.4}
     fixed = nodes[:, 2] == 0.0
-    one = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=fixed, **options)
+    one = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=fixed, element="linear", **options)
     parts = [Tetrahedra(nodes, part, **options) for part in (tetrahedra[::2], tetrahedra[1::2])]
     two = MechanicalModel(nodes, parts, fixed=fixed)
     x = nodes + 0.1 * np.sin(5.0 * nodes) * nodes[:, 2:]

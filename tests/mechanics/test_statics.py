@@ -20,7 +20,13 @@ from softgym_envs.mechanics.solvers.statics import Statics
 
 def notched_beam(notched, **options):
     model = MechanicalModel.from_mesh(
-        notched.nodes, notched.tetrahedra, fixed=notched.fixed, young_modulus=3.0e6, poisson_ratio=0.3, **options
+        notched.nodes,
+        notched.tetrahedra,
+        fixed=notched.fixed,
+        element="linear",
+        young_modulus=3.0e6,
+        poisson_ratio=0.3,
+        **options,
     )
     model.add_cable("cable", notched.cable_points, notched.pull_point, unilateral=False)
     return model
