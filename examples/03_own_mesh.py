@@ -27,7 +27,8 @@ model = MechanicalModel.from_file(
     gravity=(0.0, 0.0, -9.81),
 )
 guides = np.column_stack([np.linspace(0.005, 0.095, 10), np.full(10, 0.010), np.full(10, 0.017)])
-model.add_cable("cable", guides, pull_point=[-0.005, 0.010, 0.017])
+# A guide acts on the part of its channel within a radius: a single point would cut through a fine mesh.
+model.add_cable("cable", guides, pull_point=[-0.005, 0.010, 0.017], radius=2e-3)
 model.add_effector("tip", [0.099, 0.010, 0.010])
 
 statics = Statics(model)

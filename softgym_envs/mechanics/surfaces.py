@@ -261,7 +261,8 @@ class ShapeCheck:
         rows = [c.cavity if isinstance(c, SealedAir) else c for group in "as" for c in model.constraints[group]]
         cavities = {id(each): each for each in [*rows, *sealed] if isinstance(each, Cavity)}
         touching = model.contact is not None and model.contact.self_contact
-        cells = [block.corners for block in model.solids if block.points > 1]
+        # A sliver turns inside out by less than its neighbours are strained.
+        cells = [_solid_cells(model.nodes, block.corners) for block in model.solids if block.points > 1]
         return cls([] if touching else cavities.values(), cells)
 
     def check(self, x: np.ndarray) -> None:
@@ -280,7 +281,17 @@ class ShapeCheck:
         for cells in self._cells:
             if (cell := _inside_out(x, cells)) >= 0:
                 place = np.round(x[cells[cell]].mean(axis=0), 4).tolist()
-                raise ImpossibleState(f"element {cell} near {place} m has turned inside out; refine the mesh there")
+                raise ImpossibleState(
+                    f"an element near {place} m has turned inside out; refine the mesh there, or spread what loads it "
+                    "over a radius"
+                )
+
+
+def _solid_cells(nodes: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
+    """Return the tetrahedra (m, 4) that are no slivers: thicker than about a thirtieth of their edges."""
+    edges = nodes[tetrahedra[:, 1:]] - nodes[tetrahedra[:, :1]]
+    longest = np.linalg.norm(edges, axis=2).max(axis=1)
+    return tetrahedra[np.linalg.det(edges) > 0.03 * longest**3]
 
 
 def check_cavities(cavities: Iterable[Constraint], x: np.ndarray) -> None:

@@ -92,7 +92,7 @@ def test_a_quadratic_cell_that_is_inside_out_is_no_state():
     x = model.nodes.copy()
     x[0] = [0.021, 0.021, 0.021]  # a corner pushed through its opposite faces
     with pytest.raises(
-        ImpossibleState, match=r"element \d+ near \[.*\] m has turned inside out; refine the mesh there"
+        ImpossibleState, match="an element near .* m has turned inside out; refine the mesh there, or spread"
     ):
         check.check(x)
 
