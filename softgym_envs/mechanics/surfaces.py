@@ -265,15 +265,11 @@ class ShapeCheck:
         cells = [_solid_cells(model.nodes, block.corners) for block in model.solids if block.points > 1]
         return cls([] if touching else cavities.values(), cells)
 
-    def check(self, x: np.ndarray) -> None:
-        """Check the rows of a state [m], shape (n, 3).
-
-        Raises:
-            ImpossibleState: with the cavity or cell, and the place.
-        """
+    def problem(self, x: np.ndarray) -> ImpossibleState | None:
+        """Return what is wrong with the rows of a state [m], shape (n, 3): the cavity or cell, and the place."""
         for cavity, triangles in self._cavities:
             if (place := self_intersection(x, triangles)) is not None:
-                raise ImpossibleState(
+                return ImpossibleState(
                     f"the walls of '{cavity.name}' pass through each other near {np.round(place, 4).tolist()} m, "
                     "because they do not touch each other in this model; let them touch with "
                     "set_contact(settings=ContactSettings(self_contact=True))"
@@ -281,10 +277,11 @@ class ShapeCheck:
         for cells in self._cells:
             if (cell := _inside_out(x, cells)) >= 0:
                 place = np.round(x[cells[cell]].mean(axis=0), 4).tolist()
-                raise ImpossibleState(
+                return ImpossibleState(
                     f"an element near {place} m has turned inside out; refine the mesh there, or spread what loads it "
                     "over a radius"
                 )
+        return None
 
 
 def _solid_cells(nodes: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:

@@ -1,15 +1,14 @@
 """Static equilibrium of displacement- and effort-driven actuators.
 
-Newton's method solves the KKT system through its Schur complement: each iteration factorises the tangent once and
-solves for the few constraint columns, which also gives ``W``. Step lengths follow the affine-invariant natural
-monotonicity test of Deuflhard (Newton Methods for Nonlinear Problems, 2004, algorithm NLEQ-ERR): a step is accepted
-when the simplified Newton correction that follows it is smaller, which needs no scaling between forces and
-displacements. Displacement-driven cables are unilateral: each correction solves a small linear complementarity problem.
-Bonds are driven rows that are always held at zero.
+Newton's method solves the KKT system by its Schur complement: an iteration factorises the tangent once and solves for
+the few constraint columns, which also gives ``W``. Step lengths follow the affine-invariant monotonicity test of
+Deuflhard (Newton Methods for Nonlinear Problems, 2004, NLEQ-ERR): a step is accepted when the simplified correction
+that follows is smaller, whatever the scales of forces and lengths. Displacement-driven cables are unilateral: each
+correction solves a small linear complementarity problem. Bonds are driven rows that are always held at zero.
 
-With contact, steps stop before anything passes through anything (continuous collision detection along the way that is
-taken), and their lengths follow an exact penalty function instead: the energy less the work of given efforts, plus the
-violation of driven rows. A barrier grows too fast for the monotonicity test.
+With contact, steps stop before anything passes through anything (continuous collision detection on the way), and their
+lengths follow an exact penalty function: the energy less the work of given efforts, plus the violation of driven rows.
+A barrier grows too fast for the monotonicity test.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from softgym_envs.errors import ConvergenceError, ImpossibleState, no_equilibrium
+from softgym_envs.errors import ConvergenceError, no_equilibrium
 from softgym_envs.mechanics.assembly import Assembled
 from softgym_envs.mechanics.condensation import ContactModel
 from softgym_envs.mechanics.contact.contact import ContactMemory
@@ -60,13 +59,11 @@ class Statics:
         max_iterations: limit of Newton iterations per load increment.
         max_halvings: the smallest load increment is ``0.5 ** max_halvings`` of the whole step.
         exact_compliance: compute ``W`` and stability at each equilibrium. Otherwise they may be those of the last
-            iterate, which saves a factorisation; without friction, `exact_compliance.exact_at` computes them later.
-        compiled: solve bodies of beams in compiled code (`BeamMotion`) where that converges fast; it gives the same
-            equilibria to the tolerance.
+            iterate, which saves a factorisation; without friction, `exact_at` computes them later.
+        compiled: solve bodies of beams in compiled code (`BeamMotion`) where that is fast; the equilibria are the same.
 
     Attributes:
-        x: current node positions [m], shape (n, 3).
-        effort: current efforts of all rows, shape (size,).
+        x: current node positions [m], shape (n, 3), and ``effort``: current efforts of all rows, shape (size,).
         unilateral: actuator rows that cannot push, shape (n_a,); may be changed between solves.
         compliance: of the drives of all rows, shape (size,), see `Constraint`; may be changed between solves.
         linearisation: the equations linearised where the last iteration ended.
@@ -444,8 +441,7 @@ class Statics:
             larger than commanded, and their effort is zero.
 
         Raises:
-            ConvergenceError: if no equilibrium is found, or walls of cavities or cells are inside out there
-                (`ImpossibleState`); the last converged state is kept.
+            ConvergenceError: if no equilibrium is found that a body can have; the last converged state is kept.
             ValueError: for a wrong shape, a non-finite value, an unknown mode, or a negative effort on an actuator that
                 cannot push.
         """
@@ -511,11 +507,9 @@ class Statics:
             if linear.has_friction:
                 self._accept()
                 found = replace(found, memory=self.memory)
-        try:
-            self._shape.check(self.x)
-        except ImpossibleState:
+        if (impossible := self._shape.problem(self.x)) is not None:
             self.snapshot = before
-            raise
+            raise impossible
         return found
 
     def contact_model(self, *, each_point: bool = False, friction: bool = False) -> ContactModel:
