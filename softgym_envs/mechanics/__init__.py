@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from softgym_envs.mechanics.mesh_checks import merge_nodes as merge_nodes
     from softgym_envs.mechanics.model import MechanicalModel as MechanicalModel
     from softgym_envs.mechanics.solvers.dynamics import Dynamics as Dynamics
-    from softgym_envs.mechanics.solvers.rollout import roll_out as roll_out
     from softgym_envs.mechanics.solvers.statics import Statics as Statics
 
 __getattr__, __dir__, __all__ = lazy_exports(
@@ -41,7 +40,6 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "mesh_checks": ["merge_nodes"],
         "model": ["MechanicalModel"],
         "solvers.dynamics": ["Dynamics"],
-        "solvers.rollout": ["roll_out"],
         "solvers.statics": ["Statics"],
     },
 )
