@@ -264,7 +264,15 @@ def test_indices_of_a_sensitivity_study_are_explained(softgym, monkeypatch, tmp_
 
 @pytest.mark.parametrize(
     "arguments",
-    [["deploy", "finger", "x.h"], ["show", "finger", "--picture", "x.png"], ["configs", "--copy", "copies"]],
+    [
+        ["deploy", "finger", "x.h"],
+        ["show", "finger", "--picture", "x.png"],
+        ["configs", "--copy", "copies"],
+        ["rollout", "SoftGym/FingerReach-v0", "--record", "x.rrd"],
+        ["rollout", "SoftGym/FingerReach-v0", "--paraview", "x"],
+        ["rollout", "SoftGym/FingerReach-v0", "--video", "x.gif"],
+        ["rollout", "SoftGym/FingerReach-v0", "--video", "x.mp4"],
+    ],
 )
 def test_a_full_disk_is_one_line_that_names_the_file(arguments, softgym, monkeypatch, tmp_path):
     def full(_):

@@ -96,8 +96,8 @@ class ParaviewWriter:
     def _write(self, part: str, step: int, mesh: pyvista.DataSet) -> None:
         name = f"{part}/{step:04d}.{PARTS[part]}"
         path = self.folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        mesh.save(path)
+        with atomic_write(path, "w") as stream:
+            stream.write(_text(mesh))
         self._steps.setdefault(part, []).append((step, name))
 
     def _skin(self, x: np.ndarray) -> pyvista.PolyData:
@@ -106,6 +106,18 @@ class ParaviewWriter:
         mesh = pyvista.PolyData.from_regular_faces(self._surface.points(x), self._surface.triangles)
         mesh.cell_data["kind"] = surface_kinds(self._surface)
         return mesh
+
+
+def _text(mesh: pyvista.DataSet) -> str:
+    """Return a mesh as an XML file; VTK itself leaves files incomplete, without a word, where the disk is full."""
+    import pyvista
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter, vtkXMLUnstructuredGridWriter
+
+    writer = vtkXMLPolyDataWriter() if isinstance(mesh, pyvista.PolyData) else vtkXMLUnstructuredGridWriter()
+    writer.SetInputData(mesh)
+    writer.WriteToOutputStringOn()
+    writer.Write()
+    return str(writer.GetOutputString())
 
 
 def _volume(model: MechanicalModel, x: np.ndarray) -> pyvista.UnstructuredGrid:

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import errno
-import os
-import shutil
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -20,6 +16,7 @@ from softgym_envs.envs.tasks.base import LENGTHS, DistanceScale
 from softgym_envs.extras import require
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Robot
+from softgym_envs.storage import atomic_write
 from softgym_envs.units import display, effort_unit
 from softgym_envs.viewer.scene import COLORS, STUB, tension_color
 from softgym_envs.viewer.surface import BodySurface, ShapeFinder, cable_lines
@@ -93,10 +90,9 @@ class RolloutRecorder:
             blueprint.Horizontal(*views, blueprint.Vertical(*plots), column_shares=[3] * len(views) + [2]),
             collapse_panels=True,
         )
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        handle, self._temporary = tempfile.mkstemp(dir=self.path.parent, prefix=f".{self.path.name}.")
-        os.close(handle)
-        self._stream.save(self._temporary, default_blueprint=layout)
+        # rerun's own files lack what a full disk does not take, without a word.
+        self._memory = self._stream.memory_recording()
+        self._stream.send_blueprint(layout, make_active=False)
         self._stream.send_recording_name(self.name)
         for role in self.roles:
             self.begin(role)
@@ -107,15 +103,11 @@ class RolloutRecorder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        try:
-            self._stream.disconnect()
-            if kind is None:
-                if shutil.disk_usage(self.path.parent).free == 0:  # rerun drops what it cannot write
-                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.path))
-                os.chmod(self._temporary, 0o644)
-                os.replace(self._temporary, self.path)
-        finally:
-            Path(self._temporary).unlink(missing_ok=True)
+        content = self._memory.drain_as_bytes()
+        self._stream.disconnect()
+        if kind is None:
+            with atomic_write(self.path) as file:
+                file.write(content)
 
     def log(
         self,
