@@ -16,7 +16,7 @@ from softgym_envs.codesign.scheduling.storage import SharedStorage, StudyStorage
 from softgym_envs.config import check_config
 from softgym_envs.errors import ConfigError, DataError
 from softgym_envs.runs import RunFolder, check_compatible
-from softgym_envs.storage import atomic_write, read_json, write_json
+from softgym_envs.storage import RESTORE, atomic_write, read_json, read_signed, write_json, write_signed
 
 EXTENSIBLE = (
     *("name", "title", "trials", "workers", "executor", "heartbeat", "patience", "attempts"),
@@ -83,8 +83,14 @@ class StudyFolder(RunFolder[StudyConfig]):
                 folder.begin(config)
             elif folder.config != config:
                 folder.keep(config)
+            if not new:
+                folder.check_complete()
             if not (folder.path / "goals.json").exists():
-                write_json(folder.path / "goals.json", draw_goals(config) if goals is None else goals)
+                write_signed(folder.path / "goals.json", draw_goals(config) if goals is None else goals)
+            elif goals is not None and goals != folder.stored_goals:
+                raise DataError(
+                    f"'{folder.path / 'goals.json'}' has other goals than storage '{config.storage}'; {RESTORE}"
+                )
         return folder
 
     def _agree(self, config: StudyConfig, shown: str, wait: bool) -> dict[str, Any]:
@@ -121,6 +127,13 @@ class StudyFolder(RunFolder[StudyConfig]):
             write_json(known, {"id": shared["id"]})
         return shared["goals"]
 
+    def check_complete(self) -> None:
+        """Raise DataError if there are results of trials without the files that they follow from."""
+        needed = ["goals.json", *(["journal.log"] if self.config.storage == JOURNAL else [])]
+        missing = next((name for name in needed if not (self.path / name).exists()), None)
+        if missing is not None and self.result_files():
+            raise DataError(f"'{self.path / missing}' is missing, but there are results of trials; {RESTORE}")
+
     def _tested_with(self) -> tuple[str, ...]:
         """Return the settings with which finalists in the folder were tested, or trained for their tests.
 
@@ -137,8 +150,13 @@ class StudyFolder(RunFolder[StudyConfig]):
     @cached_property
     def goals(self) -> dict[str, np.ndarray]:
         """Goals [m] by use: ``training`` (k, 3), ``selection`` (k, p, 3), ``unseen`` (k, p, 3)."""
-        stored = read_json(self.path / "goals.json")
+        stored = self.stored_goals
         return {name: np.array(stored[name], dtype=float) for name in ("training", "selection", "unseen")}
+
+    @property
+    def stored_goals(self) -> dict[str, Any]:
+        """The goals as plain data, as `draw_goals` returns them."""
+        return read_signed(self.path / "goals.json")
 
     def account(self) -> Account:
         """Return the time spent so far."""
@@ -181,8 +199,18 @@ class StudyFolder(RunFolder[StudyConfig]):
         return sorted((self.path / "trials").glob("[0-9]*/result.json"))
 
     def results(self) -> list[TrialResult]:
-        """Read the results of all finished trials, by number."""
-        return [TrialResult.read(path) for path in self.result_files()]
+        """Read the results of all finished trials, by number.
+
+        Raises:
+            DataError: if a file is damaged, or that of another trial.
+        """
+        results = []
+        for path in self.result_files():
+            result = TrialResult.read(path)
+            if self.trial(result.number) != path.parent:
+                raise DataError(f"'{path}' is the result of trial {result.number}; {RESTORE}")
+            results.append(result)
+        return results
 
 
 def _accept(old: StudyConfig, new: StudyConfig, where: str, use: str, fixed: tuple[str, ...]) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from softgym_envs.agents.evaluation import Evaluation, none_for_nan
 from softgym_envs.codesign.metrics.metric import Measurement
 from softgym_envs.errors import DataError
-from softgym_envs.storage import read_json, write_json
+from softgym_envs.storage import RESTORE, read_json, read_signed, write_json, write_signed
 
 
 def plain(value: Any) -> Any:
@@ -55,22 +55,39 @@ class Record:
     @classmethod
     def read(cls, path: Path) -> Self:
         """Read a file; see `from_json`."""
-        data = read_json(path)
+        return cls._of(path, read_json(path), "")
+
+    @classmethod
+    def _of(cls, path: Path, data: Any, remedy: str) -> Self:
         try:
             return cls.from_json(data)
         except (DataError, TypeError, ValueError) as error:
-            raise DataError(f"'{path}': {error}") from None
+            raise DataError(f"'{path}': {error}{remedy}") from None
 
     def write(self, path: Path) -> None:
         """Write a file, whole or not at all."""
         write_json(path, self.to_json())
 
 
+class StudyRecord(Record):
+    """Base of records that a study reads again: their files carry a hash, see `read_signed`."""
+
+    REMEDY: ClassVar[str] = "restore it from a copy, or remove it and run the study again"
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        return cls._of(path, read_signed(path, cls.REMEDY), f"; {cls.REMEDY}")
+
+    def write(self, path: Path) -> None:
+        write_signed(path, self.to_json())
+
+
 @dataclass(eq=False)
-class TrialResult(Record):
+class TrialResult(StudyRecord):
     """Result of one trial."""
 
     EVALUATIONS = ("evaluation", "qp", "judge")
+    REMEDY = RESTORE
 
     number: int
     origin: str  # of its body: "baseline", "screen 3", "joint 0" or "sampler 7"
@@ -113,7 +130,7 @@ class TrialResult(Record):
 
 
 @dataclass(eq=False)
-class ScreenResult(Record):
+class ScreenResult(StudyRecord):
     """Score of one candidate of the screen."""
 
     EVALUATIONS = ("evaluation",)
@@ -126,7 +143,7 @@ class ScreenResult(Record):
 
 
 @dataclass(eq=False)
-class SharedPolicy(Record):
+class SharedPolicy(StudyRecord):
     """The policy that scores every body, and what it cost."""
 
     policy: str  # its file, relative to the folder of the study
@@ -138,7 +155,7 @@ class SharedPolicy(Record):
 
 
 @dataclass(eq=False)
-class FinalistTraining(Record):
+class FinalistTraining(StudyRecord):
     """A policy that was trained anew for a finalist."""
 
     trial: int
@@ -154,7 +171,7 @@ REFINED = "refined"
 
 
 @dataclass(eq=False)
-class FinalistTest(Record):
+class FinalistTest(StudyRecord):
     """Evaluation of one finalist with one controller on one backend."""
 
     EVALUATIONS = ("evaluation",)
@@ -174,7 +191,7 @@ class FinalistTest(Record):
 
 
 @dataclass(eq=False)
-class Account(Record):
+class Account(StudyRecord):
     """Time that a study took."""
 
     command: str = ""  # that last ran it

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from softgym_envs.codesign.config import StudyConfig
+from softgym_envs.codesign.config import JOURNAL, StudyConfig
 from softgym_envs.codesign.folder import SHARED_POLICY_RECORD, StudyFolder
 from softgym_envs.codesign.goals import Stratum, first_goals, missed_first
 from softgym_envs.codesign.metrics.metric import Metric
@@ -324,15 +324,20 @@ def load_study(folder: str | Path | StudyFolder) -> StudySnapshot:
     """Read all that a study has found so far; it need not be finished.
 
     Raises:
-        DataError: if the folder has no study, or a file is damaged.
+        DataError: if the folder has no study, a file is damaged, or the results are not those of the journal.
     """
     study = folder if isinstance(folder, StudyFolder) else StudyFolder(folder)
     path = study.path
     study.config  # noqa: B018 - raises where there is no study
+    trials = study.results()
+    if study.config.storage == JOURNAL and (path / "journal.log").exists():
+        from softgym_envs.codesign.scheduling.agreement import check_journal
+
+        check_journal(study, trials)
     shared = path / SHARED_POLICY_RECORD
     return StudySnapshot(
         folder=study,
-        trials=study.results(),
+        trials=trials,
         screen=[ScreenResult.read(file) for file in sorted(path.glob("screen/[0-9]*.json"))],
         shared_policy=SharedPolicy.read(shared) if shared.exists() else None,
         all_tests=[FinalistTest.read(file) for file in sorted(path.glob("finalists/trial*.json"))],

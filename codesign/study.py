@@ -69,6 +69,7 @@ def run_study(
         ConfigError: if the folder or the database holds another study, the database cannot be opened, the number of
             workers is not positive, the policy was trained for another environment, or the sampler fails.
         ValueError: if the environment cannot be made.
+        DataError: if a file of the folder is missing, damaged or edited.
         WeightsError: if the policy to start from is missing or damaged.
         SoftGymError: if an error of the suite ended a worker.
         softgym_envs.codesign.scheduling.processes.WorkerError: if any other exception ended a worker.
@@ -90,6 +91,7 @@ def run_study(
     if new or known.config.finalists != config.finalists:
         check_tests(config)
     study = StudyFolder.create(folder, config)
+    load_study(study)  # notice damaged files before anything follows from them
     output = Progress(study, enabled=progress)
     try:
         if config.screen.enabled:

@@ -22,7 +22,7 @@ import yaml
 
 from softgym_envs.config import Config, ModelT, difference, load_config
 from softgym_envs.errors import ConfigError, DataError
-from softgym_envs.storage import atomic_write, read_json, write_json
+from softgym_envs.storage import RESTORE, atomic_write, read_json, write_json
 from softgym_envs.version import __version__
 
 if TYPE_CHECKING:
@@ -59,20 +59,25 @@ class RunFolder(Generic[ModelT]):
 
         Raises:
             ConfigError: if the folder holds something else, or its configuration cannot be read.
-            DataError: if it holds no run.
+            DataError: if it holds no run, or its configuration is damaged.
         """
         if not self.begun:
-            raise DataError(f"'{self.path}' is not the folder of {self.kind}: it has no config.yaml")
+            raise DataError(
+                f"'{self.path}' is not the folder of {self.kind}: it has no config.yaml; name another folder"
+            )
         file = self.path / "config.yaml"
         try:
             head, _, content = file.read_text().partition("\n")
             if head != _signature(content):
+                _check_yaml(file, f"{head}\n{content}")
                 raise ConfigError(
-                    "its config.yaml was edited after the run began, so that its results would stand under another "
-                    "configuration; edit a copy elsewhere"
+                    "its config.yaml was edited after the run began, or is incomplete, so that its results would stand "
+                    "under another configuration; edit a copy elsewhere"
                 )
             return load_config(file, self.model)
-        except (ConfigError, UnicodeDecodeError, OSError) as error:
+        except UnicodeDecodeError as error:
+            raise DataError(f"'{file}' is damaged ({error}); {RESTORE}") from None
+        except (ConfigError, OSError) as error:
             raise ConfigError(f"folder '{self.path}' does not hold {self.kind}: {error}; use another folder") from None
 
     def begin(self, config: ModelT) -> None:
@@ -166,6 +171,15 @@ class RunFolder(Generic[ModelT]):
     def stamp(self) -> dict[str, Any]:
         """Return the provenance of a result of this call, with all changes of the code during the run."""
         return {**provenance(), "code_changes": code_changes(self.path)}
+
+
+def _check_yaml(file: Path, content: str) -> None:
+    """Raise DataError if a configuration cannot be read at all, as where it was cut off or overwritten."""
+    try:
+        yaml.safe_load(content)
+    except (yaml.YAMLError, RecursionError) as error:
+        reason = " ".join(str(error).split()) if isinstance(error, yaml.YAMLError) else "nested too deeply"
+        raise DataError(f"'{file}' is damaged ({reason}); {RESTORE}") from None
 
 
 def _signature(content: str) -> str:

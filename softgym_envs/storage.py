@@ -91,6 +91,47 @@ def write_json(path: str | Path, value: object) -> None:
         stream.write("\n")
 
 
+SIGNATURE = "sha256"
+"""Key of a signed JSON file: the hash of its name and of everything else in it."""
+
+RESTORE = "restore it from a copy, or begin anew in another folder"
+"""What to do about a damaged file that nothing can compute again."""
+
+
+def write_signed(path: str | Path, value: dict[str, Any]) -> None:
+    """Write a JSON file atomically, with a hash by which `read_signed` notices that it was edited or damaged."""
+    content = {key: item for key, item in value.items() if key != SIGNATURE}
+    write_json(path, {**content, SIGNATURE: _signature(path, content)})
+
+
+def read_signed(path: str | Path, remedy: str = RESTORE) -> dict[str, Any]:
+    """Return what `write_signed` wrote.
+
+    Args:
+        path: the file; it must have the name with which it was written.
+        remedy: what to do if it is damaged, for the message.
+
+    Raises:
+        DataError: if the file is missing, truncated, edited or renamed.
+    """
+    try:
+        content = read_json(path)
+    except DataError as error:
+        raise DataError(f"{error}; {remedy}") from None
+    signature = content.pop(SIGNATURE, None) if isinstance(content, dict) else None
+    if signature is None or signature != _signature(path, content):
+        raise DataError(
+            f"'{path}' was edited, damaged or renamed after it was written, so that it may show what was never "
+            f"computed; {remedy}"
+        )
+    return content
+
+
+def _signature(path: str | Path, content: dict[str, Any]) -> str:
+    text = json.dumps(json.loads(json.dumps(content)), sort_keys=True)
+    return hashlib.sha256(f"{Path(path).name}\n{text}".encode()).hexdigest()
+
+
 def hash_of(path: str | Path) -> str:
     """Return the SHA-256 of a file in hexadecimal digits."""
     return hashlib.sha256(Path(path).read_bytes()).hexdigest()

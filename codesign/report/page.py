@@ -133,11 +133,12 @@ def write_report(folder: str | Path) -> Path:
     """Write ``report.html`` and the tables of results of a study, finished or not, and return the path of the report.
 
     Raises:
-        DataError: if the folder holds no study.
+        DataError: if the folder holds no study, or a file of it is missing, damaged or edited.
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
     snapshot = load_study(folder)
+    snapshot.folder.check_complete()
     page = _page(snapshot, write_results(snapshot))
     templates = FileSystemLoader(Path(__file__).parent / "templates")
     environment = Environment(

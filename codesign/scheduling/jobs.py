@@ -8,7 +8,7 @@ from collections.abc import Iterable
 
 from softgym_envs.codesign.folder import StudyFolder
 from softgym_envs.codesign.records import Job
-from softgym_envs.storage import write_json
+from softgym_envs.storage import write_signed
 
 POLL = 0.5
 """Time between two looks at jobs that other processes are running [s]."""
@@ -21,7 +21,7 @@ def missing_jobs(folder: StudyFolder, jobs: Iterable[Job]) -> list[Job]:
         storage = folder.open_storage()
         for job in missing:
             if (content := storage.fetch(job.path.relative_to(folder.path).as_posix())) is not None:
-                write_json(job.path, json.loads(content))
+                write_signed(job.path, json.loads(content))
     return [job for job in missing if not job.path.exists()]
 
 
@@ -44,13 +44,13 @@ def run_pending(folder: StudyFolder, jobs: Iterable[Job]) -> None:
             with storage.attempt(name) as mine:
                 if (content := storage.fetch(name)) is not None:  # done, perhaps on another machine
                     if not job.path.exists():
-                        write_json(job.path, json.loads(content))
+                        write_signed(job.path, json.loads(content))
                 elif mine:
                     made = job.make().to_json()
                     storage.publish({name: json.dumps(made).encode()})
                     # After a restart of the server two processes may have run the job: the first result counts.
                     first = storage.fetch(name)
-                    write_json(job.path, made if first is None else json.loads(first))
+                    write_signed(job.path, made if first is None else json.loads(first))
                 else:
                     busy.append(job)
         if len(busy) == len(missing):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, TypeVar
 from softgym_envs.codesign.scheduling.storage import StudyStorage
 from softgym_envs.errors import DataError
 from softgym_envs.runs import file_lock
-from softgym_envs.storage import drop_torn_line
+from softgym_envs.storage import RESTORE, drop_torn_line
 
 if TYPE_CHECKING:
     import optuna
@@ -22,32 +22,33 @@ JOURNAL_LOCK = "journal"
 T = TypeVar("T")
 
 
-def open_journal(path: Path, lock: BaseFileLock | None = None) -> optuna.storages.JournalStorage:
+def open_journal(path: Path, lock: BaseFileLock | None = None, *, mend: bool = True) -> optuna.storages.JournalStorage:
     """Return Optuna's journal in a file, without a last line that a crash cut off.
 
     Args:
         path: the file, which is made if it does not exist.
         lock: what its writers hold; default Optuna's own lock file.
+        mend: whether to remove that line; else it is ignored, and nothing is written.
 
     Raises:
-        DataError: if a line is not a record of a journal.
+        DataError: if a line is not a record of a journal, or the records contradict each other.
     """
     from optuna import storages
     from optuna.storages.journal import JournalFileBackend
 
     # Nobody else writes while we hold the lock, so a crash cut this line off and nobody has acted on it.
-    with lock or nullcontext():
-        drop_torn_line(path)
+    if mend:
+        with lock or nullcontext():
+            drop_torn_line(path)
     try:
         return storages.JournalStorage(JournalFileBackend(str(path), lock_obj=lock))  # type: ignore[arg-type]
-    except (ValueError, KeyError, TypeError):
+    except OSError:
+        raise
+    except Exception:  # Optuna replays the records, so that a wrong one may cause any exception
         for number, line in enumerate(path.read_bytes().splitlines(), start=1):
             if not _is_record(line):
-                raise DataError(
-                    f"'{path}' cannot be read: line {number} is damaged; restore the file from a copy, or begin anew "
-                    "in another folder"
-                ) from None
-        raise
+                raise DataError(f"'{path}' cannot be read: line {number} is damaged; {RESTORE}") from None
+        raise DataError(f"'{path}' cannot be read: its records contradict each other; {RESTORE}") from None
 
 
 def _is_record(line: bytes) -> bool:

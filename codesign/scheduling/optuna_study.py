@@ -70,6 +70,9 @@ def open_study(folder: StudyFolder, storage: StudyStorage | None = None, number:
             pruner=pruner,
         )
     if study.metric_names is None:
+        if not storage.shared:  # a shared one has them already
+            study.set_user_attr("config", folder.config.model_dump(mode="json"))
+            study.set_user_attr("goals", folder.stored_goals)
         _describe(study, folder.config)
     return study
 

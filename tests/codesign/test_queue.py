@@ -49,7 +49,9 @@ def test_optunas_own_tools_find_names_and_results(study):
         queue.finish(found)
         optunas = queue.study
     assert optunas.metric_names == folder.config.score_names == ["-mean_distance", "-mean_effort"]
-    assert optunas.user_attrs == {"environment": folder.config.environment.id, "strategy": folder.config.strategy}
+    described = {"environment": folder.config.environment.id, "strategy": folder.config.strategy}
+    begun = {"config": folder.config.model_dump(mode="json"), "goals": folder.stored_goals}
+    assert optunas.user_attrs == {**described, **begun}
     kept = optunas.trials[0].user_attrs
     assert (kept["values"], kept["design"], kept["controller"]) == ({"success": 0.5}, {"height": 0.02}, "qp")
 

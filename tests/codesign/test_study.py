@@ -7,6 +7,7 @@ import json
 import re
 import signal
 from collections import Counter
+from dataclasses import replace
 from html.parser import HTMLParser
 from types import SimpleNamespace
 
@@ -376,9 +377,12 @@ def test_a_study_that_goes_on_with_fewer_trials_counts_those_that_it_has(study, 
     with TrialQueue(folder) as queue:
         queue.enqueue([("baseline", folder.config.baseline_values)])
         for _ in range(3):
-            number = queue.claim().number
-            write_trial(folder, number, 1e-3 * number)
-            queue.finish(folder.result(number))
+            trial = queue.claim()
+            write_trial(folder, trial.number, 1e-3 * trial.number)
+            design, seed = folder.config.body(trial.params)[0], trial.user_attrs.get("sampler_seed")
+            result = replace(folder.result(trial.number), design=design, sampler_seed=seed)
+            result.write(folder.trial(trial.number) / "result.json")
+            queue.finish(result)
         queue.claim()  # and does not finish
     monkeypatch.setattr("softgym_envs.codesign.study.run_workers", interrupt)
     config = folder.config.model_copy(update={"trials": 2})
