@@ -19,7 +19,7 @@ from softgym_envs.agents.policy import Policy, read_tensors, save_policy
 from softgym_envs.errors import DataError, WeightsError
 from softgym_envs.extras import require
 from softgym_envs.runs import RunFolder, provenance
-from softgym_envs.storage import atomic_write, read_json, write_json
+from softgym_envs.storage import atomic_write, read_json, read_signed, write_signed
 from softgym_envs.wording import counted
 
 if TYPE_CHECKING:
@@ -183,9 +183,9 @@ def _earlier_steps(config: TrainConfig, place: RunFolder[TrainConfig]) -> int | 
 def _save_extension(place: RunFolder[TrainConfig], config: TrainConfig, earlier: int, step: int) -> None:
     """Record that a training planned for ``earlier`` steps, which has made ``step``, ends at other ones."""
     path = place.path / "provenance.json"
-    origin = read_json(path)
+    origin = read_signed(path)
     extension = {"from_steps": earlier, "to_steps": config.steps, "at_step": step, "provenance": provenance()}
-    write_json(path, {**origin, "extensions": [*origin.get("extensions", []), extension]})
+    write_signed(path, {**origin, "extensions": [*origin.get("extensions", []), extension]})
     place.keep(config)
 
 
@@ -288,7 +288,7 @@ class _Run:
             "curve": self._curve,
             "provenance": provenance(),
         }
-        origin = read_json(self._folder / "provenance.json")
+        origin = read_signed(self._folder / "provenance.json")
         card |= {key: origin[key] for key in ("extensions", "continued") if key in origin}
         if self._proposer is not None:
             self._proposer.finish(_model(self.learner))

@@ -129,7 +129,7 @@ class StudyFolder(RunFolder[StudyConfig]):
 
     def check_complete(self) -> None:
         """Raise DataError if there are results of trials without the files that they follow from."""
-        needed = ["goals.json", *(["journal.log"] if self.config.storage == JOURNAL else [])]
+        needed = ["provenance.json", "goals.json", *(["journal.log"] if self.config.storage == JOURNAL else [])]
         missing = next((name for name in needed if not (self.path / name).exists()), None)
         if missing is not None and self.result_files():
             raise DataError(f"'{self.path / missing}' is missing, but there are results of trials; {RESTORE}")

@@ -22,7 +22,7 @@ import yaml
 
 from softgym_envs.config import Config, ModelT, difference, load_config
 from softgym_envs.errors import ConfigError, DataError
-from softgym_envs.storage import RESTORE, atomic_write, read_json, write_json
+from softgym_envs.storage import RESTORE, atomic_write, read_signed, write_signed
 from softgym_envs.version import __version__
 
 if TYPE_CHECKING:
@@ -83,7 +83,7 @@ class RunFolder(Generic[ModelT]):
     def begin(self, config: ModelT) -> None:
         """Write the configuration and the provenance of a new run."""
         self.keep(config)
-        write_json(self.path / "provenance.json", provenance())
+        write_signed(self.path / "provenance.json", provenance())
 
     def keep(self, config: ModelT) -> None:
         """Write the configuration with which a run continues; its provenance stays."""
@@ -309,16 +309,16 @@ def continue_with_code(folder: str | Path) -> str:
     path = Path(folder) / "provenance.json"
     if not path.exists():
         return ""
-    begun, now = read_json(path), provenance()
+    begun, now = read_signed(path), provenance()
     change = code_change(begun, now)
     continued = begun.get("continued", [])
     if change and all(code_change(begun, other) != change for other in continued):
-        write_json(path, {**begun, "continued": [*continued, now]})
+        write_signed(path, {**begun, "continued": [*continued, now]})
     return change
 
 
 def code_changes(folder: str | Path) -> list[str]:
     """Return each `code_change` that `continue_with_code` recorded in a results folder."""
     path = Path(folder) / "provenance.json"
-    begun = read_json(path) if path.exists() else {}
+    begun = read_signed(path) if path.exists() else {}
     return [code_change(begun, now) for now in begun.get("continued", [])]

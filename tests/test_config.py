@@ -12,7 +12,7 @@ from softgym_envs.agents import EnvironmentConfig, TrainConfig
 from softgym_envs.config import Config, check_config, difference
 from softgym_envs.errors import ConfigError, DataError
 from softgym_envs.runs import check_compatible, code_change, commit_of, continue_with_code, provenance
-from softgym_envs.storage import JsonLines, drop_torn_line, read_json, write_json
+from softgym_envs.storage import JsonLines, drop_torn_line, read_json, read_signed, write_signed
 from softgym_envs.version import __version__
 
 
@@ -176,12 +176,12 @@ def test_the_hash_of_the_sources_follows_code_and_weights_alone(tmp_path, monkey
 def test_continuing_with_other_code_is_recorded_once(tmp_path):
     assert continue_with_code(tmp_path) == ""  # nothing was begun
     path, begun = tmp_path / "provenance.json", provenance()
-    write_json(path, begun)
-    assert continue_with_code(tmp_path) == "" and read_json(path) == begun
+    write_signed(path, begun)
+    assert continue_with_code(tmp_path) == "" and read_signed(path) == begun
     begun["versions"]["softgym-envs"] = "0.0.1"
-    write_json(path, begun)
+    write_signed(path, begun)
     texts = {continue_with_code(tmp_path) for _ in range(2)}
     assert texts == {f"begun with softgym-envs 0.0.1; continued with softgym-envs {__version__}"}
-    stored = read_json(path)
+    stored = read_signed(path)
     (continued,) = stored.pop("continued")
     assert stored == begun and continued["versions"]["softgym-envs"] == __version__

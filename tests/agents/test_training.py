@@ -18,6 +18,7 @@ from softgym_envs.agents.policy import Policy
 from softgym_envs.agents.training import train
 from softgym_envs.config import load_config, shipped_configs
 from softgym_envs.errors import ConfigError, DataError, WeightsError
+from softgym_envs.storage import write_signed
 from tests.agents.interruption import interrupted_at
 
 CONFIG = TrainConfig.model_validate(
@@ -219,7 +220,7 @@ def test_a_training_that_other_code_continues_says_so(tmp_path, capfd):
     path = tmp_path / "provenance.json"
     begun = json.loads(path.read_text())
     begun["versions"]["softgym-envs"] = "0.0.1"
-    path.write_text(json.dumps(begun))
+    write_signed(path, begun)
     policy = train(config, tmp_path)
     assert capfd.readouterr().out.count("was begun with softgym-envs 0.0.1; continued with softgym-envs ") == 1
     assert len(Policy(policy).card["continued"]) == 1

@@ -10,6 +10,7 @@ from softgym_envs.codesign.progress import Countdown, duration
 from softgym_envs.codesign.report.findings import findings
 from softgym_envs.codesign.snapshot import load_study
 from softgym_envs.codesign.study import run_study
+from softgym_envs.storage import write_signed
 from softgym_envs.version import __version__
 
 
@@ -55,7 +56,7 @@ def test_other_code_than_began_a_study_is_said_once_and_reported(tmp_path, capsy
     run_study(StudyConfig.model_validate(tiny(trials=1, sampler={"name": "random"})), folder, progress=False)
     begun = json.loads(path.read_text())
     begun["versions"]["softgym-envs"] = "0.0.1"
-    path.write_text(json.dumps(begun))
+    write_signed(path, begun)
     change = f"begun with softgym-envs 0.0.1; continued with softgym-envs {__version__}"
     wider = {"trials": 2, "sampler": {"name": "random"}, "finalists": {"count": 1, "seeds": 0}}
     results = run_study(StudyConfig.model_validate(tiny(**wider)), folder)

@@ -15,6 +15,7 @@ from softgym_envs.codesign.tools.search import search
 from softgym_envs.codesign.tools.sensitivity import analyse_sensitivity, morris, one_at_a_time, sample, sobol
 from softgym_envs.config import check_config, load_config
 from softgym_envs.errors import ConfigError, ConvergenceError, InfeasibleDesign
+from softgym_envs.storage import read_signed, write_signed
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs" / "design"
 BODIES = {
@@ -260,8 +261,8 @@ def test_an_interrupted_sensitivity_study_continues(tmp_path):
 
 def begun_by_other_code(folder):
     """Let the provenance of a folder say that other code began its results; return this provenance."""
-    record = json.loads((folder / "provenance.json").read_text()) | {"sources": "other", "commit": None}
-    (folder / "provenance.json").write_text(json.dumps(record))
+    record = read_signed(folder / "provenance.json") | {"sources": "other", "commit": None}
+    write_signed(folder / "provenance.json", record)
     return record
 
 
@@ -279,14 +280,14 @@ def test_a_continued_run_keeps_its_first_provenance(stub, tmp_path, capsys):
     ):
         folder = tmp_path / name
         run(1)
-        begun = json.loads((folder / "provenance.json").read_text())
+        begun = read_signed(folder / "provenance.json")
         run(1)  # by the same code
-        assert json.loads((folder / "provenance.json").read_text()) == begun
+        assert read_signed(folder / "provenance.json") == begun
         assert json.loads((folder / "result.json").read_text())["code_changes"] == []
         begun = begun_by_other_code(folder)
         capsys.readouterr()
         run(2)
-        kept = json.loads((folder / "provenance.json").read_text())
+        kept = read_signed(folder / "provenance.json")
         (continued,) = kept.pop("continued")
         change = f"begun with sources other; continued with sources {continued['sources']}"
         assert kept == begun
