@@ -255,7 +255,7 @@ def test_a_training_ends_where_it_stands(tmp_path):
 
 def test_a_damaged_configuration_of_a_folder_is_named(tmp_path):
     (tmp_path / "config.yaml").write_text("steps: [1, 2")
-    with pytest.raises(ConfigError, match="does not hold a training: its config.yaml was edited"):
+    with pytest.raises(DataError, match=r"config\.yaml' is damaged .* line 1, column 8.*; restore it from a copy"):
         train(CONFIG, tmp_path, progress=False)
 
 
