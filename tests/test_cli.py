@@ -8,11 +8,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 
 from softgym_envs.cli import app
 from softgym_envs.codesign.scheduling import worker
+from softgym_envs.viewer.video import write_video
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -283,6 +285,20 @@ def test_a_full_disk_is_one_line_that_names_the_file(arguments, softgym, monkeyp
     status, _, err = softgym(*arguments)
     assert status == 2 and re.fullmatch(r"softgym: error: '(x|copies).*': No space left on device\n", err)
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
+
+
+def test_a_film_that_does_not_fit_into_the_temporary_folder_is_not_written(tmp_path):
+    resource = pytest.importorskip("resource")
+    frames = np.random.default_rng(0).integers(0, 255, (10, 100, 100, 3), dtype=np.uint8)
+    allowed, most = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, most))  # as full as a disk
+    try:
+        with pytest.raises(OSError, match=r"the film is incomplete; .*x\.mp4'"):
+            write_video(tmp_path / "x.mp4", frames)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (allowed, most))
+    assert list(tmp_path.iterdir()) == []
+    write_video(tmp_path / "x.mp4", frames)
 
 
 def test_a_file_in_the_way_of_a_folder_is_named(softgym, monkeypatch, tmp_path):

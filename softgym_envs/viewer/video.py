@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import tempfile
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -72,7 +74,7 @@ def animation(frames: Sequence[np.ndarray], fps: float, kind: str = "gif") -> by
 
 
 def _mp4(frames: Sequence[np.ndarray], fps: float) -> bytes:
-    from imageio_ffmpeg import write_frames
+    from imageio_ffmpeg import count_frames_and_secs, write_frames
 
     height, width = (n - n % 2 for n in frames[0].shape[:2])
     with tempfile.TemporaryDirectory() as folder:
@@ -83,4 +85,8 @@ def _mp4(frames: Sequence[np.ndarray], fps: float) -> bytes:
         for frame in frames:
             writer.send(np.ascontiguousarray(frame[:height, :width]))
         writer.close()
-        return file.read_bytes()
+        with suppress(RuntimeError):  # of a film that cannot be read
+            if count_frames_and_secs(str(file))[0] == len(frames):
+                return file.read_bytes()
+    # ffmpeg itself leaves films incomplete, without a word, where the disk is full.
+    raise OSError(errno.ENOSPC, "the film is incomplete; is the temporary folder full?", folder)
