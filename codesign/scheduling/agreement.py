@@ -82,7 +82,8 @@ def _difference(config: StudyConfig, trial: FrozenTrial, result: TrialResult) ->
         state = "COMPLETE" if result.state == "complete" else "PRUNED"
         rows += [
             ("state", trial.state.name, state),
-            ("scores", trial.values, result.scores),
+            # Optuna gives pruned trials their last report as a value.
+            ("scores", trial.values if trial.state.name == "COMPLETE" else None, result.scores),
             ("values", known.get("values"), result.values),
             ("controller", known.get("controller"), result.controller),
         ]
