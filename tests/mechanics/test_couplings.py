@@ -311,7 +311,7 @@ def test_an_unreachable_contact_reports_the_reached_fraction(touched):
 def test_nodes_may_be_held_along_some_axes(box):
     """A bar between two rollers under its own weight shortens by g L^2 rho / 2 E, and grows sideways freely."""
     nodes, tetrahedra = box((0.01, 0.01, 0.1), (2, 2, 10), jitter=0.2)
-    young, density, gravity = 1e6, 1000.0, 0.01
+    young, density, gravity = 1e6, 1000.0, 0.1
     model = MechanicalModel.from_mesh(
         nodes,
         tetrahedra,
