@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
 from softgym_envs.mechanics.elements.quadratic import EDGES, QuadraticTetrahedra, add_midside_nodes
+from softgym_envs.mechanics.solvers.tangent import Tangent
 
-if TYPE_CHECKING:
-    from softgym_envs.mechanics.model import MechanicalModel
+Body = Any
+"""A `MechanicalModel`, whose module imports this one."""
 
 TOLERATED = 0.05
 """Share of the compliance that an element may miss without a warning."""
@@ -23,7 +24,7 @@ class LockingWarning(UserWarning):
     """The elements that were asked for make a body much stiffer than it is."""
 
 
-def missing_compliance(model: MechanicalModel) -> float | None:
+def missing_compliance(model: Body) -> float | None:
     """Return the share of the compliance at rest that a body's solid lacks against quadratic elements on its mesh.
 
     The compliance is the work of a uniform load, as of weight, on the displacement that it causes; the worst of the
@@ -50,24 +51,24 @@ def missing_compliance(model: MechanicalModel) -> float | None:
     return float((1.0 - _compliances(model) / exact).max())
 
 
-def _compliances(model: MechanicalModel) -> np.ndarray:
+def _compliances(model: Body) -> np.ndarray:
     """Work of a uniform load of 1 N/m3 along each axis of space on the displacements at rest [J], shape (3,)."""
-    from softgym_envs.mechanics.solvers.linearisation import Linearisation
-
-    solid = model.solids[0]
+    solid, assembly = model.solids[0], model.assembly
     volumes = solid.nodal_masses(len(model.nodes)) / solid.density
-    linear = Linearisation(model)
-    linear.update(model.nodes, np.zeros(model.assembly.size))
+    assembled = assembly.evaluate(model.nodes, np.zeros(assembly.size), np.zeros_like(model.nodes), None)
+    assert assembled is not None and assembled.tangent is not None  # at rest no element is inverted
+    tangent = Tangent(assembly.indptr, assembly.indices, model.solver)
+    tangent.factorise(assembled.tangent, None)
     out = np.empty(3)
     for axis in range(3):
         load = np.zeros_like(model.nodes)
         load[:, axis] = volumes
         force = model.kinematics.equation_force(model.nodes, load)
-        out[axis] = force @ linear.solve(force)
+        out[axis] = force @ tangent.solver.solve(force[:, None])[:, 0]
     return out
 
 
-def warn_of_locking(model: MechanicalModel, element: str) -> None:
+def warn_of_locking(model: Body, element: str) -> None:
     """Warn if elements that were asked for miss much of a body's compliance; see `missing_compliance`."""
     missing = None if element == "quadratic" or not model.solids[0].density else missing_compliance(model)
     if missing is None or missing <= TOLERATED:

@@ -186,7 +186,9 @@ def _source(build: Callable[..., object]) -> tuple[str, dict[str, float]]:
     if ast.get_docstring(function) is not None:
         del function.body[0]
     constants = {
-        k: v for k, v in vars(sys.modules[build.__module__]).items() if k.isupper() and isinstance(v, int | float)
+        name: value
+        for name, value in vars(sys.modules[build.__module__]).items()
+        if name.isupper() and isinstance(value, int | float) and name != "TYPE_CHECKING"
     }
     return "".join(ast.unparse(code).split()), constants
 
