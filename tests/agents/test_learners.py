@@ -13,7 +13,7 @@ from softgym_envs.agents.learners.ppo import PPOLearner
 from softgym_envs.agents.policy import Policy, read_tensors, save_policy
 from softgym_envs.agents.residual import BatchQP
 from softgym_envs.agents.training import CHECKPOINT, _restore, train
-from softgym_envs.errors import DataError, WeightsError
+from softgym_envs.errors import ConfigError, WeightsError
 from softgym_envs.extensions.deployment.policy_onnx import exported_spaces
 from softgym_envs.extensions.learners.evolution import EvolutionConfig, EvolutionLearner
 from softgym_envs.extensions.learners.recurrent import RecurrentConfig, RecurrentLearner
@@ -88,7 +88,7 @@ def test_same_seed_same_policy_and_interruptions_change_nothing(name, tmp_path):
         train(config, tmp_path / "resumed", progress=False)
     torch.manual_seed(5)  # a new process would have other random states
     assert train(config, tmp_path / "resumed", progress=False).read_bytes() == first
-    with pytest.raises(DataError, match="learner"):
+    with pytest.raises(ConfigError, match="holds a training with learner"):
         train(short("sac", sac={"learning_starts": 100}), tmp_path / "resumed", progress=False)
 
 

@@ -187,7 +187,7 @@ def test_an_error_in_one_job_does_not_stop_the_others(swept, tmp_path, capsys):
     broken.mkdir(parents=True)
     (broken / "config.yaml").write_text((swept / "out/runs/tiny/seed0/config.yaml").read_text())  # of seed 0
     assert sweep.sweep([tmp_path / "tiny.yaml"], [1], 1, tmp_path / "out", goals=2, fem_goals=0) == 1
-    assert "another configuration" in capsys.readouterr().out
+    assert "holds a training with seed = 0, got 1" in capsys.readouterr().out
     assert (tmp_path / "out/results/tiny/baselines.json").exists()
     (tmp_path / "bad.yaml").write_text("environment: {id: SoftGym/Octopus-v0}")
     with pytest.raises(ConfigError, match="Octopus"):
