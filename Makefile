@@ -97,6 +97,7 @@ check: lint types setup
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -q -m "not slow" $(ARGS)
 
 test: setup test-programs
+	$(BIN)/python -m tests.compile_kernels
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal $(ARGS)
 
 # ARGS="torchrl skrl" runs these clients only.
