@@ -50,7 +50,7 @@ def _numbers(robot: Robot, design: Any) -> dict[str, Any]:
         model = robot.build(design)
     except InfeasibleDesign:
         return {}
-    parts = [type(block).__name__ for block in model.blocks] + [str(solid.material) for solid in model.solids]
+    parts = [type(block).__name__ for block in model.blocks] + [type(solid.material).__name__ for solid in model.solids]
     constraints = [*model.constraints["a"], *model.constraints["e"]]
     found: dict[str, Any] = {
         "parts": parts + [type(constraint).__name__ for constraint in constraints],
