@@ -198,7 +198,7 @@ MISTAKES = {
     ),
     "robot": (
         lambda _: make_robot("fingr"),
-        "unknown robot 'fingr'; did you mean 'finger'? allowed: finger, diamond, *",
+        "unknown robot 'fingr'; did you mean 'finger'?",
     ),
     "robot option": (
         lambda _: make_robot("finger", cabels=1),

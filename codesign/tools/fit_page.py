@@ -152,7 +152,8 @@ def calibration_page(
     ]
     if result.correlations is not None and len(result.correlations) > 1:
         contents.append(_correlations(result.correlations))
-    contents += [residual_picture(title, data, readings) for title, data, readings in parts if len(data)]
+    measured = [(title, data, readings) for title, data, readings in parts if not np.isnan(data.effector).all()]
+    contents += [residual_picture(title, data, readings) for title, data, readings in measured]
     return Page(f"Calibration {name}", sentences, contents)
 
 

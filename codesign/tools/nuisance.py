@@ -173,7 +173,7 @@ def check_nuisances(nuisances: Nuisances, robot: Robot, fitted: Sequence[str], b
         for part in columns:
             kind = nuisance.kind if part == nuisance.kind else f"{nuisance.kind} of {part}"
             if not isinstance(nuisance, OffsetConfig) and (other := taken.setdefault(kind, name)) != name:
-                raise ValueError(f"nuisances: '{other}' and '{name}' are both {kind}; allowed: one")
+                raise ValueError(f"nuisances: '{other}' and '{name}' both describe {kind}; allowed: one")
 
 
 def _columns_and_unit(

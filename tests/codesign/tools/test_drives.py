@@ -15,7 +15,7 @@ from softgym_envs.codesign.tools.config import CalibrationConfig
 from softgym_envs.codesign.tools.measurements import Measurements, read_measurements, write_measurements
 from softgym_envs.codesign.tools.nuisance import make_instrument
 from softgym_envs.config import check_config
-from softgym_envs.envs.plant import Plant
+from softgym_envs.envs.plant import play
 from softgym_envs.errors import DataError
 
 COLUMNS = [f"cable_{k}_displacement" for k in (1, 2)]
@@ -46,11 +46,11 @@ def recorded():
     commands = np.concatenate([one, two, 0.5 * (one + two)])
     trial = tuple(name for name in ("left", "right", "both") for _ in range(10))
     instrument = make_instrument(TRUTH, config.nuisances, robot, "displacement")
-    # Independently of the code under test: play by the option of environments, row by row.
-    plant = Plant(gain=0.93, offset=(0.0, -6e-4), backlash=(8e-4, 0.0))
+    # Independently of the code under test: play as in environments, row by row.
     done = []
     for k, command in enumerate(commands):
-        done.append(plant.drive(command, np.zeros(2) if k % 10 == 0 else done[-1]))
+        last = np.zeros(2) if k % 10 == 0 else done[-1]
+        done.append(play(0.93 * command + [0.0, -6e-4], last, np.array([8e-4, 0.0])))
     np.testing.assert_allclose(instrument.driven(commands, trial)[0], done, atol=1e-15)
     backend = FEMBackend(robot)
     backend.cable_compliance = TRUTH["stretch"]
@@ -133,7 +133,7 @@ def test_wrong_parameters(name, changes, message):
 
 
 def test_parameters_that_describe_the_same():
-    with pytest.raises(ValueError, match="are both gain of cable_1_displacement; allowed: one"):
+    with pytest.raises(ValueError, match="both describe gain of cable_1_displacement; allowed: one"):
         configured(nuisances={"a": NUISANCES["gain"], "b": NUISANCES["gain"]})
     with pytest.raises(ValueError, match="needs backend 'fem', got 'surrogate'"):
         configured(nuisances={"a": NUISANCES["gain"]}, backend="surrogate")

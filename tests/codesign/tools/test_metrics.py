@@ -103,10 +103,9 @@ def test_a_cavity_whose_walls_pass_through_each_other_is_infeasible():
     lengths = {"outer_radius": 0.009046666, "joint_height": 0.006523373, "bellow_height": 0.008001691}
     lengths |= {"wall_thickness": 0.003899209, "cork_thickness": 0.004741054, "plateau_height": 0.003413125}
     design = {"slope": 0.5589782, **lengths}
-    for name in ("relative_volume_change", "volume_change"):
+    for name in ("relative_volume_change", "volume_change", "angular_displacement"):
         with pytest.raises(InfeasibleDesign, match="walls of 'cavity_1' pass through each other"):
             Evaluator(robot, [name], actuation=[PULL])(design)
-    assert Evaluator(robot, ["angular_displacement"], actuation=[PULL])(design)["angular_displacement"] > 0.4
     with pytest.raises(InfeasibleDesign, match="walls of 'cavity_1' pass through each other"):
         robot.readings(design)
 

@@ -182,7 +182,7 @@ def test_wrong_nuisance_parameters(tensions):
         configured("length", nuisances={"distance": {**CONTACT, "unit": "mm"}})
     with pytest.raises(ConfigError, match="three numbers that are not all zero"):
         configured("length", nuisances={"distance": {**CONTACT, "normal": [0, 0, 0]}})
-    with pytest.raises(ConfigError, match="'a' and 'b' are both contacts; allowed: one"):
+    with pytest.raises(ConfigError, match="'a' and 'b' both describe contact; allowed: one"):
         configured("length", nuisances={"a": CONTACT, "b": CONTACT})
     with pytest.raises(ConfigError, match="'length' is a variable of the body; use another name"):
         configured("young_modulus", nuisances={"length": OFFSET})
