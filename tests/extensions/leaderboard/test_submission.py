@@ -29,7 +29,7 @@ def submission(tiny):
 def refused(submission, folder, message, data):
     path = folder / "submission.json"
     submission.write(path)
-    with pytest.raises(SubmissionRefused, match=message) as error:
+    with pytest.raises((SubmissionRefused, DataError), match=message) as error:
         verify(path, data=data)
     assert "\n" not in str(error.value)
 
@@ -50,9 +50,11 @@ def test_a_true_submission_is_accepted_and_recorded(submission, tiny, tmp_path, 
     assert "| by hand | a test | small |" in board.leaderboard(tmp_path / "none", data, [path])
     again = verify(path, data=data)
     assert again.scores == verdict.scores and not again.record
-    for forged in (verdict.scores[0][0] * 0.9, float("inf"), float("nan")):
+    submission.claimed = [[verdict.scores[0][0] * 0.9]]
+    refused(submission, tmp_path, r"the score on the test goals is .*, but running the body again gives", data)
+    for forged in (float("inf"), float("nan")):
         submission.claimed = [[forged]]
-        refused(submission, tmp_path, r"the score on the test goals is .*, but running the body again gives", data)
+        refused(submission, tmp_path, r"claimed holds numbers that are not finite", data)
 
 
 def test_differences_below_the_tolerance_of_the_inverse_qp_are_rounding():
