@@ -74,8 +74,12 @@ def check_robot(
         progress: called with the name of each examination before it begins.
 
     Raises:
+        ValueError: for fewer than one body or command.
         Exception: any error of the robot's own code, with a note that names the design.
     """
+    for label, count in (("bodies", bodies), ("commands", commands)):
+        if count < 1:
+            raise ValueError(f"{label} = {count} must be 1 or more")
     rng = np.random.default_rng(seed)
     progress("baseline")
     with warnings.catch_warnings(record=True) as caught:

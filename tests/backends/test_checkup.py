@@ -88,6 +88,12 @@ def test_a_fault_is_found_with_its_remedy(cls, subject, verdict, words):
     assert any(words in f"{finding.text} {finding.remedy}" for finding in found), found
 
 
+@pytest.mark.parametrize("label", ["bodies", "commands"])
+def test_examining_nothing_is_refused(label):
+    with pytest.raises(ValueError, match=f"{label} = 0 must be 1 or more"):
+        next(check_robot(Beam(), **{label: 0}))
+
+
 @pytest.mark.parametrize("layers", [1, 3])
 def test_thickness_and_layers_of_a_plate(layers):
     nodes, tetrahedra = box_mesh((0.06, 0.06, 0.005 * layers), (12, 12, layers))

@@ -23,6 +23,7 @@ from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import Robot
 from softgym_envs.storage import atomic_write
+from softgym_envs.wording import counted
 
 SLICES = 40
 """Thin slices from which the compliance along the axis is measured."""
@@ -155,7 +156,8 @@ def chain_of(robot: Robot, design: Mapping[str, float] | None = None, *, joints:
 def _check(robot: Robot, model: MechanicalModel) -> None:
     if len(model.blocks) != 1 or len(model.solids) != 1:
         raise ValueError(
-            f"robot '{robot.name}' has {len(model.blocks)} parts; a chain of links is made of one solid"
+            f"robot '{robot.name}' is made of {counted(len(model.blocks), 'part')}, of which {len(model.solids)} are "
+            "solids; a chain of links is made of one solid"
         )
     others = [constraint.name for constraint in model.constraints["a"] if not isinstance(constraint, Cable)]
     if others:
@@ -228,7 +230,7 @@ def _joint(sections: _Sections, before: int, after: int, place: np.ndarray, axis
     return Joint(place, axes, centres, 1.0 / values, 1.0 / float(axis @ (slid[:, 3] - by_hinges)))
 
 
-def _solve(model: MechanicalModel, forces: np.ndarray | float = 0.0) -> np.ndarray:
+def _solve(model: MechanicalModel, forces: np.ndarray) -> np.ndarray:
     """Return the rows [m] of the equilibrium under dead forces [N] on the rows, with slack cables."""
     model.nodal_loads += forces
     try:
