@@ -301,6 +301,11 @@ class FEMBackend(Backend):
         """Compiled solver of the present body; None for a body that needs the general one."""
         return (self._dynamics or self._statics).beam_solver()
 
+    @property
+    def not_compiled(self) -> str | None:
+        """Why the general solver computes the present body; None for a body of beams that compiled code can solve."""
+        return (self._dynamics or self._statics).not_compiled
+
     def go_to(
         self, x: np.ndarray, effort: np.ndarray, delta: np.ndarray, velocity: np.ndarray, command: np.ndarray
     ) -> None:

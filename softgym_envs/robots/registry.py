@@ -21,6 +21,7 @@ ROBOTS = Registry(
         "two_finger_friction_gripper": "softgym_envs.robots.friction_grippers:TwoFingerFrictionGripper",
         "three_finger_friction_gripper": "softgym_envs.robots.friction_grippers:ThreeFingerFrictionGripper",
         "tetrapod": "softgym_envs.robots.tetrapod:Tetrapod",
+        "quadruped": "softgym_envs.robots.quadruped:Quadruped",
         "three_finger_gripper": "softgym_envs.robots.grippers:ThreeFingerGripper",
     },
     base="softgym_envs.robots.base:Robot",
