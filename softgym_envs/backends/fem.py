@@ -10,6 +10,7 @@ import numpy as np
 
 from softgym_envs.backends.backend import Backend, PointForce, Snapshot, State, check_command, check_numbers
 from softgym_envs.backends.time_steps import TimeSteps, check_still
+from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import ContactModel
 from softgym_envs.mechanics.constraints.cable import Cable
@@ -119,7 +120,7 @@ class FEMBackend(Backend):
     def reset(self, design: Mapping[str, float] | None = None) -> State:
         complete = self.design if design is None else self.robot.design_space.complete(design)
         if complete != self.design:
-            model = self.robot.build(complete)
+            model = self._build(complete)
             self._set_friction(model)
             self._set_compliance(model)
             statics = self._solver(model)
@@ -139,6 +140,9 @@ class FEMBackend(Backend):
         self.restore(self._rest)
         self._mode = "displacement"  # mode of the current state's command
         return self.state
+
+    def _build(self, design: Design) -> MechanicalModel:
+        return self.robot.build(design)
 
     def touch(self, load: PointForce | None) -> None:
         loads = self._own_loads.copy()

@@ -21,8 +21,13 @@ def dataset(config: Path, folder: Path, quiet: bool, overrides: tuple[str, ...])
     An interrupted run continues where it stopped.
     """
     from softgym_envs.config import load_config
+    from softgym_envs.surrogate.parts.training import PartConfig, generate_part_data
     from softgym_envs.surrogate.training import FitConfig, generate_datasets
 
+    if _is_part(config):
+        held = generate_part_data(load_config(config, PartConfig, overrides), folder)
+        click.echo(counted(len(held.body), "state"))
+        return
     with options.resumable():
         data = generate_datasets(load_config(config, FitConfig, overrides), folder, progress=not quiet)
     for split, columns in data.items():
@@ -41,13 +46,25 @@ def fit(config: Path, folder: Path, data: Path | None, quiet: bool, overrides: t
     stopped.
     """
     from softgym_envs.config import load_config
+    from softgym_envs.surrogate.parts.training import PartConfig, fit_part
     from softgym_envs.surrogate.training import FitConfig
     from softgym_envs.surrogate.training import fit as run
 
+    if _is_part(config):
+        part = load_config(config, PartConfig, overrides)
+        click.echo(json.dumps(fit_part(part, folder, data or folder / "data", progress=not quiet), indent=2))
+        return
     with options.resumable():
         errors = run(load_config(config, FitConfig, overrides), folder, data or folder / "data", progress=not quiet)
     click.echo(json.dumps(errors, indent=2))
     click.echo("errors of the effector are in metres, all others are shares (1 is 100%)", err=True)
+
+
+def _is_part(config: Path) -> bool:
+    """Whether a configuration is that of a learned part, not of a whole robot."""
+    from softgym_envs.config import config_text, read_value
+
+    return "part" in (read_value(config_text(config)) or {})
 
 
 @click.command("calibrate-trust")

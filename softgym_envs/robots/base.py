@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import inspect
 from abc import ABC, abstractmethod
@@ -115,6 +116,9 @@ class Robot(ABC):
         made_of_beams: bodies are quadratic beams and rigid parts, moved by servos or chambers; finite elements step
             many of them at once.
         backends: backends of its own, ``"module:class"``, by the name that they replace or add.
+        learned_parts: names of the parts that `assemble` takes from `parts`, if there are any there.
+        parts: learned parts by name: functions of a design and of gravity that return the options of the element; see
+            `of_parts`.
         always_touches: whether the options of contact matter without obstacles and self-contact.
         symmetries: reflections and rotations, besides the identity, that map every body and its mesh to itself.
             Surrogates also learn from the images of their states.
@@ -141,6 +145,8 @@ class Robot(ABC):
     free_object: bool = False
     made_of_beams: bool = False
     backends: Mapping[str, str] = {}
+    learned_parts: tuple[str, ...] = ()
+    parts: Mapping[str, Callable[[Mapping[str, float], np.ndarray], dict[str, Any]]] = {}
     design_boxes: Mapping[str, Mapping[str, tuple[float, float]]] = {}
     symmetries: tuple[Symmetry, ...] = ()
     non_mechanical_options: tuple[str, ...] = ("unilateral", "design_box")
@@ -266,6 +272,12 @@ class Robot(ABC):
         except Exception as error:
             error.add_note(f"while assembling robot '{self.name}' for {complete}")
             raise
+
+    def of_parts(self, parts: Mapping[str, Callable[[Mapping[str, float], np.ndarray], dict[str, Any]]]) -> Robot:
+        """Return the robot whose bodies have learned parts in place of finite elements; see `learned_parts`."""
+        made = copy.copy(self)
+        made.parts = parts
+        return made
 
     def printable(self) -> Robot:
         """Return the robot whose solid parts are this one's body; it takes the same designs."""

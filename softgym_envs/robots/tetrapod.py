@@ -6,7 +6,7 @@ The published frame has y up. Here z is up: the published (x, y, z) is (x, z, -y
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,10 +18,11 @@ from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.constraints.servo import Servo
 from softgym_envs.mechanics.elements.beams import Beam, Section
+from softgym_envs.mechanics.elements.parts import Port, PoseParts
 from softgym_envs.mechanics.elements.rigid import sphere_inertia
 from softgym_envs.mechanics.frames import frame_rows
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.skins import box_skin, tube_skin
+from softgym_envs.mechanics.skins import box_skin, curve_skin, tube_skin
 from softgym_envs.robots.base import Actuator, Robot
 from softgym_envs.robots.mesh_tiers import choose_mesh
 
@@ -37,6 +38,8 @@ CENTRE_MASS = 0.020
 HANGING = -0.150
 """Published height of the centre at rest [m], from which the search for the equilibrium starts."""
 UP = np.array([0.0, 0.0, 1.0])
+POISSON_RATIO, DENSITY = 0.45, 1220.0
+"""Of the printed legs; density [kg/m3]."""
 
 WIDEST = 3.0
 """Largest angle of a servo to either side [rad]: at pi, both directions of turning are the same position."""
@@ -67,6 +70,8 @@ class Tetrapod(Robot):
     size = 0.2
     rest_mode = "displacement"
     made_of_beams = True
+    learned_parts = ("leg",)
+    backends = {"surrogate": "softgym_envs.backends.parts:PartsBackend"}
     non_mechanical_options = (*Robot.non_mechanical_options, "servo_range")
 
     def __init__(
@@ -125,7 +130,7 @@ class Tetrapod(Robot):
         mass = CENTRE_MASS + self.payload
         assembly.add_mass(centre, mass, sphere_inertia(mass, CENTRE_RADIUS))
         section = Section.rectangle(design["leg_width"], design["leg_thickness"])
-        servos = []
+        servos, ports = [], []
         for k in range(4):
             angle = 0.5 * math.pi * k
             outwards = np.array([math.cos(angle), math.sin(angle), 0.0])
@@ -134,6 +139,14 @@ class Tetrapod(Robot):
             servos.append((servo, -along))
             root = (radius + HORN) * outwards
             tip = middle + CENTRE_RADIUS * outwards
+            if self.parts:
+                ports.append(
+                    (
+                        Port(servo, root, np.column_stack([-UP, along, outwards])),
+                        Port(centre, tip, np.column_stack([-outwards, along, -UP])),
+                    )
+                )
+                continue
             shape = _bent(root, -UP, tip, -outwards, length, along, 2 * self.elements + 1)
             mounts = {0: servo, 2 * self.elements: centre}
             frames = [assembly.add_frame(p, r, on=mounts.get(j)) for j, (p, r) in enumerate(shape)]
@@ -141,10 +154,14 @@ class Tetrapod(Robot):
                 frames,
                 section=section,
                 young_modulus=design["young_modulus"],
-                poisson_ratio=0.45,
-                density=1220.0,
-                stress_free=self._printed(root, outwards, along, design),
+                poisson_ratio=POISSON_RATIO,
+                density=DENSITY,
+                stress_free=_printed(root, np.column_stack([-UP, along, outwards]), design, 2 * self.elements + 1),
             )
+        if self.parts:
+            options = self.parts["leg"](design, np.array(self.gravity))
+            ends = [port.frame for pair in ports for port in pair]
+            assembly.add_element(PoseParts, ends, ports=ports, **options)
         model = assembly.build()
         for actuator, (servo, axis) in zip(self.actuators, servos, strict=True):
             model.add("a", Servo(actuator.name, servo, axis, model.nodes))
@@ -152,35 +169,53 @@ class Tetrapod(Robot):
         half = 0.5 * np.array([design["leg_width"], design["leg_thickness"]])
         outline = half * np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)])
         model.skins += [tube_skin(leg, model.nodes, outline) for leg in model.blocks if isinstance(leg, Beam)]
+        model.skins += [curve_skin(near, far, length, outline, model.nodes) for near, far in ports]
         # The legs begin on the sides of the centre: it stays back, so that its skin and theirs do not touch there.
         side = CENTRE_RADIUS - JOINT_GAP
         model.skins.append(box_skin(centre, (side, side, 0.4 * CENTRE_RADIUS), model.nodes))
         return model
-
-    def _printed(
-        self, root: np.ndarray, outwards: np.ndarray, along: np.ndarray, design: Mapping[str, float]
-    ) -> np.ndarray:
-        """Frames of a leg as printed: from the root downwards, with a curvature that is quadratic along the leg."""
-        count, length = 2 * self.elements + 1, design["leg_length"]
-        knots = [design[f"curvature_{k}"] for k in (1, 2, 3)]
-        curvature = np.polynomial.Polynomial.fit([0.0, 0.5 * length, length], knots, 2)
-        turn = curvature.integ(lbnd=0.0)
-        fine = np.linspace(0.0, length, 20 * (count - 1) + 1)
-        directions = -np.cos(turn(fine))[:, None] * UP - np.sin(turn(fine))[:, None] * outwards
-        steps = 0.5 * (directions[1:] + directions[:-1]) * np.diff(fine)[:, None]
-        points = root + np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
-        return np.array(
-            [
-                frame_rows(p, np.column_stack([d, along, np.cross(d, along)]))
-                for p, d in zip(points[::20], directions[::20], strict=True)
-            ]
-        )
 
     def reference_path(self, count: int = 60) -> np.ndarray:
         """Horizontal circle of radius 40 mm about the hanging position, 10 mm higher, shape (count, 3)."""
         angle = 2.0 * np.pi * np.arange(count) / count
         circle = 0.040 * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(count)])
         return self.effector_rest + np.array([0.0, 0.0, 0.010]) + circle
+
+
+def printed_leg(curvatures: Sequence[float], length: float, count: int) -> np.ndarray:
+    """Return the frames of a leg as printed, evenly spaced, in the axes of its root.
+
+    It begins along the first axis and bends in the plane of the first and third one, with a curvature that is quadratic
+    along it.
+
+    Args:
+        curvatures: at its root, in its middle and at its tip [1/m]; positive against the third axis.
+        length: [m].
+        count: number of frames.
+
+    Returns:
+        Rows of the frames [m], shape (count, 4, 3).
+    """
+    turn = np.polynomial.Polynomial.fit([0.0, 0.5 * length, length], curvatures, 2).integ(lbnd=0.0)
+    fine = np.linspace(0.0, length, 20 * (count - 1) + 1)
+    angles = turn(fine)
+    directions = np.column_stack([np.cos(angles), np.zeros(len(fine)), -np.sin(angles)])
+    steps = 0.5 * (directions[1:] + directions[:-1]) * np.diff(fine)[:, None]
+    points = np.vstack([np.zeros(3), np.cumsum(steps, axis=0)])
+    across = np.array([0.0, 1.0, 0.0])
+    return np.array(
+        [
+            frame_rows(p, np.column_stack([d, across, np.cross(d, across)]))
+            for p, d in zip(points[::20], directions[::20], strict=True)
+        ]
+    )
+
+
+def _printed(root: np.ndarray, axes: np.ndarray, design: Mapping[str, float], count: int) -> np.ndarray:
+    """Return rows of the printed frames of a leg [m] (count, 4, 3) with axes at its root as columns (3, 3)."""
+    rows = printed_leg([design[f"curvature_{k}"] for k in (1, 2, 3)], design["leg_length"], count) @ axes.T
+    rows[:, 0] += root
+    return rows
 
 
 def _bent(
