@@ -104,9 +104,9 @@ def environment_sections(identifier: str) -> dict[str, Callable[[], str]]:
             (3, difference, f"x / (1 + abs(x)) of it over {error}", goal_unit),
         ]
         if task.sensors:
-            count = len(robot.sensor_scale)
-            unit_seen = robot.sensor_unit
-            volumes = f"x / (1 + abs(x)) of it over {quantity(float(robot.sensor_scale[0]), unit_seen)}"
+            count = len(robot.sensing.scale)
+            unit_seen = robot.sensing.unit
+            volumes = f"x / (1 + abs(x)) of it over {quantity(float(robot.sensing.scale[0]), unit_seen)}"
             parts = [
                 parts[0],
                 (count, "change of the volume of each cavity since the body was undeformed", volumes, unit_seen),

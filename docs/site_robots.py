@@ -100,7 +100,12 @@ def model_facts(robot: Robot) -> list[list[str]]:
     if model.mass > 0.0:
         rows.append(["mass", f"{1e3 * model.mass:.1f} g"])
     rows.append(["effector of the baseline body at rest", point(robot.effector_rest)])
-    rows.append(["efforts scale exactly with", f"`{robot.stiffness_variable}`" if robot.stiffness_variable else "-"])
+    rows.append(
+        [
+            "efforts scale exactly with",
+            f"`{robot.learning.stiffness_variable}`" if robot.learning.stiffness_variable else "-",
+        ]
+    )
     return rows
 
 
@@ -138,7 +143,7 @@ def robot_sections(name: str) -> dict[str, Callable[[], str]]:
 
     def weights() -> str:
         if has_surrogate(name):
-            return f"Weights of a surrogate ship for the default options (`{robot.weights_name}`)."
+            return f"Weights of a surrogate ship for the default options (`{robot.learning.weights}`)."
         return "With the default options no surrogate ships that environments run on: they run on finite elements."
 
     def environments() -> str:

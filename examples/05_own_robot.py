@@ -9,6 +9,7 @@ from softgym_envs import DesignSpace, DesignVariable
 from softgym_envs.control import InverseQP
 from softgym_envs.mechanics import MechanicalModel
 from softgym_envs.robots import Actuator, Robot
+from softgym_envs.robots.capabilities import Learning
 
 
 def bar(layers):
@@ -29,7 +30,7 @@ class Arm(Robot):
     size = 0.1
     effector_rest = (0.0, 0.0, 0.1)
     effort_scale = (5.0, 5.0, 5.0)
-    stiffness_variable = "young_modulus"
+    learning = Learning(stiffness_variable="young_modulus")
     design_space = DesignSpace(
         DesignVariable("length", 0.08, 0.12, 0.10, "m", "length of the arm"),
         DesignVariable("width", 0.010, 0.016, 0.012, "m", "side of its square section"),

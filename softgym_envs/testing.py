@@ -296,7 +296,7 @@ def untrained_potential(
     design = Features(robot).design_size
     middle, half = 0.5 * (robot.upper + robot.lower), 0.5 * (robot.upper - robot.lower)
     at_rest = -middle / half if rest else None
-    nets = [PotentialNet(n, e, design, width, 16, at_rest, robot.convex) for _ in range(members)]
+    nets = [PotentialNet(n, e, design, width, 16, at_rest, robot.learning.convex) for _ in range(members)]
     scales = {
         "energy": np.array(2.0),
         "effector_mean": np.linspace(-0.1, 0.1, e),

@@ -317,14 +317,15 @@ class SurrogateBackend(Backend):
         mass_damping: float = 0.0,
         stiffness_damping: float = 0.01,
     ) -> None:
-        if not robot.convex:
+        if not robot.learning.convex:
             raise ValueError(
                 f"robot '{robot.name}' has a non-convex energy and cannot run on the surrogate alone; use "
                 "backend='fem', or its learned model as part of a gripper"
             )
         self.robot = robot
-        learned = robot.touch_variant()
-        self.takes_touch = learned is not robot
+        touch = robot.learning.touch
+        learned = robot if touch is None else touch.variant()
+        self.takes_touch = touch is not None
         self.model = standalone_model(learned, weights, members)
         self._touch: PointForce | None = None
         self.steps = TimeSteps(control_step, time_step, mass_damping, stiffness_damping)
@@ -353,7 +354,10 @@ class SurrogateBackend(Backend):
         if load is None:
             self._body = self._untouched
         else:
-            touch = self.robot.touch_design(self.design, load.point, load.force)
+            learned = self.robot.learning.touch
+            if learned is None:
+                raise ValueError(f"no touch of robot '{self.robot.name}' is learned; use backend='fem'")
+            touch = learned.design(self.design, load.point, load.force)
             effectors = 3 * len(self.robot.effectors)
             self._body = SurrogateBody(self.model, self.design, self._motion, effectors=effectors, touch=touch)
         self._touch = load

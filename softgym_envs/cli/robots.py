@@ -34,7 +34,7 @@ def show(robot: str, options_: tuple[str, ...], design: tuple[str, ...], picture
     if as_json:
         description = {
             "robot": robot,
-            "weights_name": body.weights_name,
+            "weights_name": body.learning.weights,
             "design_variables": [asdict(each) | {"value": values[each.name]} for each in body.design_space],
             "actuators": [
                 asdict(each) | {"max_effort": each.max_effort if math.isfinite(each.max_effort) else None}
@@ -49,7 +49,7 @@ def show(robot: str, options_: tuple[str, ...], design: tuple[str, ...], picture
         }
         click.echo(json.dumps(description))
     else:
-        click.echo(f"{robot} ({body.weights_name})\n\ndesign variables:")
+        click.echo(f"{robot} ({body.learning.weights})\n\ndesign variables:")
         for variable in body.design_space:
             unit = "" if variable.unit == "1" else f" {variable.unit}"
             bounds = f"[{variable.low:g}, {variable.high:g}]{unit}"

@@ -126,7 +126,7 @@ class Plants:
             raise ValueError("plant cable_compliance needs backend 'fem' without contact and dynamics; allowed: 0")
         stiff = found.low.stiffness == found.high.stiffness == 1.0
         limited = any(np.isfinite(actuator.max_effort) for actuator in robot.actuators)
-        if not stiff and (any(robot.gravity) or robot.touches or robot.sealed or limited):
+        if not stiff and (any(robot.gravity) or robot.touches or robot.sensing.sealed or limited):
             raise ValueError(
                 f"plant stiffness: robot '{robot.name}' has weight, contacts, sealed air or limited efforts, which do "
                 "not scale with its stiffness; change its design instead"

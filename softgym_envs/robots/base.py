@@ -17,6 +17,7 @@ from softgym_envs.designs import Design, DesignSpace
 from softgym_envs.errors import InfeasibleDesign, SoftGymError
 from softgym_envs.mechanics.materials import resolve_material
 from softgym_envs.robots.actuator import Actuator as Actuator
+from softgym_envs.robots.capabilities import Learning, Sensing, View
 from softgym_envs.robots.checks import (
     CONTACT_DEFAULTS,
     WatchedDesign,
@@ -27,7 +28,6 @@ from softgym_envs.robots.checks import (
 )
 from softgym_envs.robots.geometry.meshing import BodyMesh
 from softgym_envs.robots.geometry.morphing import Feature, Morpher
-from softgym_envs.robots.geometry.symmetry import Symmetry
 from softgym_envs.robots.mesh_tiers import FOLLOWING, UNIFORM, MeshTier, choose_mesh
 
 if TYPE_CHECKING:
@@ -97,31 +97,20 @@ class Robot(ABC):
         size: a characteristic length [m], for scaling.
         effector_rest: nominal effector of the baseline body at rest [m], before loads, shape (3,).
         effort_scale: typical effort of each actuator of the baseline body [N, ...], shape (n_a,).
-        sensor_scale: typical reading of each sensor row of the condensed model; empty for a robot without sensors.
-        sensor_unit: unit of the sensor rows.
-        sealed: whether the body encloses air that resists changes of its volume.
         goal_axes: which coordinates of the first effector count towards a goal, 1 or 0, shape (3,).
         goal_tolerance: distance at which a goal counts as reached [m].
-        picture_axes: coordinates that pictures show towards the viewer, to the right and up: (0, 1, 2), (1, 2, 0) or
-            (2, 0, 1).
         workspace_scale: distance over which the effector typically moves [m], by default a quarter of the size; scales
             rewards and errors.
         rest_mode: state of the actuators at rest: ``"effort"`` (no effort) or ``"displacement"`` (held at zero).
-        stiffness_variable: design variable that scales all efforts and nothing else (Young's modulus without dead
-            loads), or None. Surrogates use it exactly instead of learning it.
-        convex: the elastic energy is convex in the actuator displacements, so that the body is also stable when its
-            actuators are driven by efforts. Surrogates rely on it; without it, they learn unstable states too.
-        free_object: whether the robot holds an object that can fall. Many commands then have no static equilibrium, so
-            pictures are framed by the robot at rest.
+        learning: what surrogates know of the robot before they learn it.
+        sensing: sensors inside the body; none by default.
+        view: from where pictures show it.
         made_of_beams: bodies are quadratic beams and rigid parts, moved by servos or chambers; finite elements step
             many of them at once.
         backends: backends of its own, ``"module:class"``, by the name that they replace or add.
         learned_parts: names of the parts that `assemble` takes from `parts`, if there are any there.
         parts: learned parts by name: functions of a design and of gravity that return the options of the element; see
             `of_parts`.
-        always_touches: whether the options of contact matter without obstacles and self-contact.
-        symmetries: reflections and rotations, besides the identity, that map every body and its mesh to itself.
-            Surrogates also learn from the images of their states.
         non_mechanical_options: options that do not change the condensed model.
     """
 
@@ -132,25 +121,19 @@ class Robot(ABC):
     size: float
     effector_rest: np.ndarray
     effort_scale: np.ndarray
-    sensor_scale: np.ndarray = np.zeros(0)
-    sensor_unit: str = "m3"
-    sealed: bool = False
     goal_axes: np.ndarray = np.ones(3)
     goal_tolerance: float = 0.002
-    picture_axes: tuple[int, int, int] = (0, 1, 2)
     workspace_scale: float
     rest_mode: str = "effort"
-    stiffness_variable: str | None = None
-    convex: bool = True
-    free_object: bool = False
+    learning: Learning = Learning()
+    sensing: Sensing = Sensing()
+    view: View = View()
     made_of_beams: bool = False
     backends: Mapping[str, str] = {}
     learned_parts: tuple[str, ...] = ()
     parts: Mapping[str, Callable[[Mapping[str, float], np.ndarray], dict[str, Any]]] = {}
     design_boxes: Mapping[str, Mapping[str, tuple[float, float]]] = {}
-    symmetries: tuple[Symmetry, ...] = ()
     non_mechanical_options: tuple[str, ...] = ("unilateral", "design_box")
-    always_touches: bool = False
     _options: dict[str, object]
 
     def __init_subclass__(cls, **options: object) -> None:
@@ -194,28 +177,6 @@ class Robot(ABC):
         Raises:
             InfeasibleDesign: if the geometry cannot exist. All other exceptions count as errors in the robot's code.
         """
-
-    @property
-    def weights_name(self) -> str:
-        """Name of the pretrained weights; variants of a robot with different mechanics have different names."""
-        return self.name
-
-    @property
-    def load_variables(self) -> tuple[str, ...]:
-        """Design variables that say what acts on the body, not what the body is."""
-        return ()
-
-    def touch_variant(self) -> Robot:
-        """Return the robot whose design also says what touches it, as it is learned; itself if no touch is learned."""
-        return self
-
-    def touch_design(self, design: Mapping[str, float], point: np.ndarray, force: np.ndarray) -> dict[str, float]:
-        """Return the `load_variables` of `touch_variant` for a force [N] (3,) at a point [m] (3,) of a complete design.
-
-        Raises:
-            ValueError: for a touch that is not learned.
-        """
-        raise ValueError(f"no touch of robot '{self.name}' is learned; use backend='fem'")
 
     def own_obstacles(self, model: MechanicalModel, design: Mapping[str, float]) -> Sequence[Obstacle]:
         """Return the rigid objects that are part of an assembled robot, as obstacles that the rest of it touches."""
@@ -320,7 +281,7 @@ class Robot(ABC):
     @property
     def may_touch(self) -> bool:
         """Whether options of contact matter."""
-        return self.touches or self.always_touches or type(self).own_obstacles is not Robot.own_obstacles
+        return self.touches or type(self).own_obstacles is not Robot.own_obstacles
 
     @property
     def options(self) -> dict[str, object]:

@@ -7,7 +7,7 @@ clamped base along +z. Four cables run to the tip and four to the middle, each p
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from softgym_envs.mechanics.materials import resolve_material
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solids import SOLIDS
 from softgym_envs.robots.base import Actuator, Robot
+from softgym_envs.robots.capabilities import Learning
 from softgym_envs.robots.geometry.symmetry import square_symmetries
 from softgym_envs.robots.mesh_tiers import choose_mesh
 
@@ -138,6 +139,7 @@ class CableTrunk(Robot):
     name = "cable_trunk"
     effectors = ("tip",)
     size = 0.195
+    learning = Learning(stiffness_variable="young_modulus")
     design_boxes = {
         # 30 % about the baseline.
         "wide": {"length": (0.1365, 0.2535), "base_half_width": (0.0091, 0.0169), "tip_half_width": (0.0035, 0.007)}
@@ -186,12 +188,11 @@ class CableTrunk(Robot):
             DesignVariable("young_modulus", 1.0e5, 2.0e6, 4.5e5, "Pa", "stiffness of the silicone", log=True),
             DesignVariable("poisson_ratio", 0.40, 0.499, 0.45, "1", "0.5 is incompressible"),
         )
-        self.stiffness_variable = None if any(gravity) else "young_modulus"
         baseline = self.design_space.baseline
         self.effector_rest = np.array([0.0, 0.0, baseline["length"]])
         self.effort_scale = np.full(8, 10.0)
         if not any(gravity[:2]) and not self.obstacles:
-            self.symmetries = square_symmetries(2)
+            self.learning = replace(self.learning, symmetries=square_symmetries(2))
         self.density = MASS / self.volume(baseline)
         self.actuators = tuple(
             # A twentieth of the stroke per control step.

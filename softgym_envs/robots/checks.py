@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 from weakref import WeakSet
 
@@ -91,8 +92,7 @@ def check_robot(robot: Robot) -> None:
         raise TypeError(f"robot '{robot.name}': effectors must be a tuple of names, got {robot.effectors!r}")
     if not hasattr(robot, "workspace_scale"):
         robot.workspace_scale = 0.25 * robot.size
-    if robot.touches and robot.contact_stiffness is not None:
-        robot.stiffness_variable = None  # this stiffness does not scale with that of the body
+    _complete_learning(robot)
     for name, count in (("effector_rest", 3), ("effort_scale", len(robot.actuators))):
         value = np.asarray(getattr(robot, name), dtype=float)
         if value.shape != (count,):
@@ -101,12 +101,25 @@ def check_robot(robot: Robot) -> None:
             raise ValueError(f"robot '{robot.name}': {name} must be finite, got {value.tolist()}")
         setattr(robot, name, value)
     # Rewards and observations are divided by these.
-    for name in ("size", "effort_scale", "sensor_scale", "goal_tolerance", "workspace_scale"):
-        value = np.asarray(getattr(robot, name), dtype=float)
+    scales = {name: getattr(robot, name) for name in ("size", "effort_scale", "goal_tolerance", "workspace_scale")}
+    for name, given in {**scales, "sensing.scale": robot.sensing.scale}.items():
+        value = np.asarray(given, dtype=float)
         if not (np.isfinite(value) & (value > 0.0)).all():
             raise ValueError(f"robot '{robot.name}': {name} must be positive and finite, got {value.tolist()}")
     _check_quantities(robot)
     _check_touching(robot)
+
+
+def _complete_learning(robot: Robot) -> None:
+    """Name the weights, and forget a stiffness that not all forces are proportional to."""
+    learning, name = robot.learning, robot.learning.stiffness_variable
+    if name is not None and name not in robot.design_space.names:
+        names = robot.design_space.names
+        raise ValueError(f"robot '{robot.name}': {unknown_name('learning.stiffness_variable', name, names)}")
+    others = any(robot.gravity) or robot.sensing.sealed or (robot.touches and robot.contact_stiffness is not None)
+    robot.learning = replace(
+        learning, weights=learning.weights or robot.name, stiffness_variable=None if others else name
+    )
 
 
 def _check_quantities(robot: Robot) -> None:

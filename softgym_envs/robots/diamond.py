@@ -7,12 +7,14 @@ cable pulls each elbow inwards, which lifts the top and tilts it away.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from softgym_envs.designs import DesignSpace, DesignVariable
 from softgym_envs.robots.base import Actuator, MeshedRobot
+from softgym_envs.robots.capabilities import Learning
 from softgym_envs.robots.geometry.meshing import BodyMesh, mesh_geometry
 from softgym_envs.robots.geometry.morphing import Feature, Plane
 from softgym_envs.robots.geometry.symmetry import mirrored, square_symmetries
@@ -85,6 +87,7 @@ class Diamond(MeshedRobot):
     name = "diamond"
     effectors = ("top",)
     size = 0.16
+    learning = Learning(stiffness_variable="young_modulus")
     #: Depth of the effector below the top, which is one millimetre in the published model [m].
     effector_depth = 1.0e-3
     meshes = {
@@ -118,11 +121,10 @@ class Diamond(MeshedRobot):
             DesignVariable("young_modulus", 1.0e5, 1.0e7, 3.0e6, "Pa", "stiffness of the silicone", log=True),
             DesignVariable("poisson_ratio", 0.40, 0.499, 0.45, "1", "0.5 is incompressible"),
         )
-        self.stiffness_variable = None if any(self.gravity) else "young_modulus"
         self.effector_rest = self._top(self.design_space.baseline)
         self.effort_scale = np.full(4, 40.0)
         if not any(self.gravity[:2]) and not self.obstacles:
-            self.symmetries = square_symmetries()
+            self.learning = replace(self.learning, symmetries=square_symmetries())
         self.actuators = tuple(
             # The published range is 0 to 30 mm. Unless the antagonists are paid out, the top stays 6 mm above the
             # published circle.

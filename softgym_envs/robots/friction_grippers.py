@@ -19,6 +19,7 @@ from softgym_envs.mechanics.contact.obstacles import Obstacle, RoundedPrism
 from softgym_envs.mechanics.elements.rigid import box_inertia
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.skins import box_skin
+from softgym_envs.robots.capabilities import Learning
 from softgym_envs.robots.grippers import STRAIGHT, TURNED, FingerRobot, ThreeFingerGripper
 
 ROUNDING = 2e-3
@@ -47,8 +48,7 @@ class FrictionGripper(FingerRobot):
     #: Pulled further, the fingers press the object so much that it turns out of the grip.
     cable_range = (0.0, 0.008)
     rest_mode = "displacement"
-    proportional_to_modulus = False  # the weight of the object does not scale with it
-    convex = False
+    learning = Learning(convex=False)  # the weight of the object does not scale with Young's modulus
 
     def __init__(
         self,

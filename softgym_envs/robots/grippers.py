@@ -21,6 +21,7 @@ from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.skins import box_skin
 from softgym_envs.robots.base import Actuator, Robot
+from softgym_envs.robots.capabilities import Learning
 from softgym_envs.robots.geometry.finger_shape import in_flange
 from softgym_envs.robots.geometry.symmetry import Symmetry
 from softgym_envs.robots.mesh_tiers import MeshTier
@@ -71,8 +72,7 @@ class FingerRobot(Robot):
     cable_rate = 0.001
     #: Nothing but contact holds the object.
     holds_by_contact = False
-    #: Without gravity, all efforts are proportional to Young's modulus.
-    proportional_to_modulus = True
+    learning = Learning(stiffness_variable="young_modulus")
 
     def __init__(
         self,
@@ -113,7 +113,6 @@ class FingerRobot(Robot):
         )
         self.effort_scale = np.full(len(self.actuators), 20.0)
         self.effector_rest = self.object_rest(self.design_space.baseline)
-        self.stiffness_variable = "young_modulus" if self.proportional_to_modulus and not any(gravity) else None
 
     def variables(self) -> tuple[DesignVariable, ...]:
         """Return the design variables: first those of the finger, then those of the gripper."""
@@ -214,7 +213,7 @@ class PressFinger(FingerRobot):
     half_extents = (13.75e-3, 13.75e-3, 13.75e-3)
     goal_axes = np.array([0.0, 1.0, 0.0])
     goal_tolerance = 5e-4
-    proportional_to_modulus = False  # the force of the button does not scale with it
+    learning = Learning()  # the force of the button does not scale with Young's modulus
 
     def __init__(self, *, button_force: float = 2.0, **options: Any) -> None:
         if not (np.isfinite(button_force) and button_force >= 0.0):
@@ -269,7 +268,8 @@ class TwoFingerGripper(FingerRobot):
         super().__init__(**options)
         if not (any(self.gravity[:2]) or self.obstacles):
             # Half a turn exchanges the fingers, which are copies of each other.
-            self.symmetries = (Symmetry(TURNED, np.array([2, 3, 0, 1]), 0.5 * np.array(self.placements[1][1])),)
+            half_turn = Symmetry(TURNED, np.array([2, 3, 0, 1]), 0.5 * np.array(self.placements[1][1]))
+            self.learning = replace(self.learning, symmetries=(half_turn,))
 
     def variables(self) -> tuple[DesignVariable, ...]:
         """Return the variables of the finger and the length of the bar."""

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from softgym_envs.designs import Design, DesignSpace, DesignVariable
 from softgym_envs.robots.base import Actuator, Drawing, MeshedRobot
+from softgym_envs.robots.capabilities import Learning
 from softgym_envs.robots.geometry.finger_shape import check_finger, draw_finger, in_flange
 from softgym_envs.robots.geometry.graded_finger import (
     draw_rounded_finger,
@@ -98,6 +100,7 @@ class SoftFinger(MeshedRobot):
     effectors = ("tip",)
     size = 0.12
     rounded = True
+    learning = Learning(stiffness_variable="young_modulus")
     meshes: Mapping[str, MeshTier] = FINGER_MESHES
 
     def __init__(
@@ -154,19 +157,17 @@ class SoftFinger(MeshedRobot):
         self.design_boxes = {"wide": WIDE_BOXES[cables]}
         # The mesh of a design does not depend on the design box.
         self._middle = {v.name: 0.5 * (v.low + v.high) for v in self.design_space if v.unit == "m"}
-        self.stiffness_variable = None if any(self.gravity) else "young_modulus"
         self.effector_rest = self.tip(self.design_space.baseline)
         self.effort_scale = np.full(cables, 20.0)
-        if is_half(self.tier) and not (self.gravity[0] or self.obstacles):
-            self.symmetries = left_right(range(cables)[::-1])
+        mirrored = is_half(self.tier) and not (self.gravity[0] or self.obstacles)
+        self.learning = replace(
+            self.learning,
+            weights=f"{self.name}_{cables}cable{'s' if cables > 1 else ''}",
+            symmetries=left_right(range(cables)[::-1]) if mirrored else (),
+        )
         self.actuators = tuple(
             Actuator(f"cable_{i + 1}", 0.0, 0.020, 0.001, unilateral=unilateral) for i in range(cables)
         )
-
-    @property
-    def weights_name(self) -> str:
-        """``finger_1cable`` or ``finger_2cables``."""
-        return "finger_1cable" if self.cables == 1 else "finger_2cables"
 
     def lengths(self, design: Mapping[str, float]) -> dict[str, float]:
         """Return the parameters of `draw_finger` [mm, rad] for a complete design."""

@@ -119,7 +119,7 @@ class StratumReport:
 
 def reached(model: SurrogateModel, context: Any, command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the displacements (B, n_a) that a model predicts under commands, and whether it found them (B,)."""
-    if not model.robot.convex:  # its cables can push
+    if not model.robot.learning.convex:  # its cables can push
         return command, np.ones(len(command), dtype=bool)
     displacement, _, found = model.search(context, command, command, model.robot.unilateral, 5e-5, 25)
     return displacement, found

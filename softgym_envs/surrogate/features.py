@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 def learned_variables(robot: Robot) -> tuple[str, ...]:
     """Design variables a surrogate learns: all but the one that only scales efforts."""
-    return tuple(name for name in robot.design_space.names if name != robot.stiffness_variable)
+    return tuple(name for name in robot.design_space.names if name != robot.learning.stiffness_variable)
 
 
 class Features:
@@ -46,7 +46,7 @@ class Features:
         self.learned = learned_variables(robot) if learned is None else learned
         self.design_size = len(self.learned) + ("poisson_ratio" in self.learned)
         # A typical reading counts as much as a tenth of the robot's size.
-        sensors = robot.sensor_scale / (0.1 * robot.size)
+        sensors = robot.sensing.scale / (0.1 * robot.size)
         self.units = np.concatenate([np.ones(len(robot.actuators) + 3 * len(robot.effectors)), sensors])
 
     def design(self, values: Array) -> Array:
@@ -65,7 +65,7 @@ class Features:
 
     def stiffness(self, values: Array) -> Array:
         """Stiffness relative to the baseline, which scales all efforts; shape (B, 1)."""
-        name = self.robot.stiffness_variable
+        name = self.robot.learning.stiffness_variable
         if name is None:
             return 0.0 * values[:, :1] + 1.0
         return values[:, [self.space.names.index(name)]] / self.space[name].baseline

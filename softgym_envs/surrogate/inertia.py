@@ -166,8 +166,8 @@ def read_inertia(folder: str | Path, robot: Robot) -> LearnedInertia:
     path = Path(folder) / FILE
     if not path.is_file():
         raise WeightsError(
-            f"robot '{robot.weights_name}' has no learned inertia '{path}', which motion on the surrogate needs: use "
-            "backend='fem' or dynamics=False, or learn it with 'softgym fit-inertia'"
+            f"robot '{robot.learning.weights}' has no learned inertia '{path}', which motion on the surrogate needs: "
+            "use backend='fem' or dynamics=False, or learn it with 'softgym fit-inertia'"
         )
     try:
         with safe_open(path, "numpy") as file:

@@ -149,7 +149,7 @@ class SurrogateModel(ABC):
         self.correction = EffortCorrection.of_card(self.card, self.features.design_size)
         self.count = len(robot.actuators)
         self.effectors = 3 * len(robot.effectors)
-        self.sensors = len(robot.sensor_scale)
+        self.sensors = len(robot.sensing.scale)
         if self.sensors and not self.senses:
             raise ValueError(f"a network of kind '{self.network}' does not learn the sensors of '{robot.name}'")
         self.size = self.count + self.effectors + self.sensors

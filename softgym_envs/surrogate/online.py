@@ -62,7 +62,7 @@ def check_ensemble(model: SurrogateModel) -> Model:
     """
     if not isinstance(model, Model):
         raise WeightsError(f"online learning needs a network of kind 'potential'; these weights are '{model.network}'")
-    if not model.robot.convex:
+    if not model.robot.learning.convex:
         raise WeightsError(f"online learning needs a convex energy; that of robot '{model.robot.name}' is not")
     if model.sensors:
         raise WeightsError(

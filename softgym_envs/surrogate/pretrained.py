@@ -26,7 +26,7 @@ _SUITE = Path(__file__).parent / "weights"
 def pretrained_folder(robot: Robot) -> Path:
     """Return the folder of a robot's shipped weights; its name ends in that of the mesh unless it is the published."""
     mesh = robot.mechanics_key.get("mesh")
-    name = robot.weights_name if mesh is None else f"{robot.weights_name}_{mesh}"
+    name = robot.learning.weights if mesh is None else f"{robot.learning.weights}_{mesh}"
     folders = [folder / name for folder in _folders(cls.__module__ for cls in type(robot).__mro__[:-1])]
     return next((folder for folder in folders if folder.is_dir()), folders[-1])
 
@@ -84,7 +84,7 @@ def pretrained_model(robot: Robot, weights: str | Path | None = None, members: i
     if weights is None and _ships_for_class(robot) and not ships_weights(robot):
         known = _contact_of(_card(pretrained_folder(robot))["mechanics_key"])
         raise WeightsError(
-            f"the shipped weights of '{robot.weights_name}' know {'self_contact' if known else 'no contact'}"
+            f"the shipped weights of '{robot.learning.weights}' know {'self_contact' if known else 'no contact'}"
             f"{' without obstacles' if known else ''}: use backend='fem' for a robot with other contact"
         )
     folder = Path(weights) if weights is not None else pretrained_folder(robot)

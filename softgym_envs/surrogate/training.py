@@ -210,7 +210,7 @@ def measure_errors(model: SurrogateModel, data: dict[str, np.ndarray]) -> dict[s
 
     ``effector``: distance between predicted and FEM effector at the same reached displacement [m]; ``compliance``:
     relative Frobenius error of W; ``effort``: relative to the largest effort in the data; ``sensor``: relative to
-    `Robot.sensor_scale`, if there are sensors.
+    `Sensing.scale`, if there are sensors.
     """
     stable = stable_rows(model.robot, data)
     data = {name: column[stable] for name, column in data.items()}
@@ -224,7 +224,7 @@ def measure_errors(model: SurrogateModel, data: dict[str, np.ndarray]) -> dict[s
     shown: dict[str, float] = {}
     if model.sensors:
         wrong = (
-            np.abs(model.sensed(context, data["displacement"]) - sensors).max(axis=1) / model.robot.sensor_scale.max()
+            np.abs(model.sensed(context, data["displacement"]) - sensors).max(axis=1) / model.robot.sensing.scale.max()
         )
         shown = {
             "sensor_mean": float(wrong.mean()),
@@ -282,7 +282,7 @@ def domain_of(
         "design": {
             n: [float(c.min()), float(c.max())]
             for n, c in zip(names, training["design"].T, strict=True)
-            if n != model.robot.stiffness_variable
+            if n != model.robot.learning.stiffness_variable
         },
     }
     data = {name: column[stable_rows(model.robot, validation)] for name, column in validation.items()}
@@ -294,7 +294,7 @@ def domain_of(
         domain["inflation"] = float(np.quantile(distance / np.maximum(spread, 1e-12), 0.95))
         limit = domain["inflation"] * float(np.quantile(spread, 0.98))
         domain["limit"] = min(limit, model.robot.goal_tolerance)
-    if model.robot.convex and 1.0 - stable.mean() > BUCKLING:
+    if model.robot.learning.convex and 1.0 - stable.mean() > BUCKLING:
         domain["growth"] = float(np.quantile(model.softening_ratio(context, data["displacement"]), 0.98))
     return domain
 
@@ -376,7 +376,7 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
         **new_card(robot, config.network.kind),
         "config": config.model_dump(mode="json", exclude={"executor"}),
         "domain": domain_of(model, every, data["validation"]),
-        "loaded": bool(robot.build().loads.any() or robot.load_variables),
+        "loaded": bool(robot.build().loads.any() or robot.learning.loads),
         "states": {split: len(rows) for split, rows in states.items()},
         "unstable_states_left_out": {split: len(learned[split]["rest"]) - len(rows) for split, rows in states.items()},
         "data_sha256": inputs["data_sha256"],

@@ -151,7 +151,7 @@ def _reached(robot: Robot, rest: State) -> np.ndarray:
     It is estimated from the condensed model at rest, without another equilibrium, which takes up to a minute on large
     meshes. The linear prediction is cut at `MAX_DEFLECTION`, because bodies that bend far move along an arc.
     """
-    if robot.free_object:
+    if robot.view.at_rest:
         return rest.effector
     compliance = rest.condensed.W
     ends = np.stack([robot.lower, robot.upper]) - rest.displacement  # (2, n_a)

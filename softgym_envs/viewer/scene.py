@@ -171,7 +171,7 @@ class Scene:
         self.robot = robot
         self._length = robot.size
         self._line = max(1.0, size[1] / 480.0)
-        self._axes = list(robot.picture_axes)
+        self._axes = list(robot.view.axes)
         cloud = self._seen(cloud)
         self._open_window(size, window)
         self._place_camera(size, cloud)

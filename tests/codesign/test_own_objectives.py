@@ -33,7 +33,6 @@ class StiffFinger(SoftFinger):
     """A robot of one's own."""
 
     name = "stiff_finger"
-    weights_name = "stiff_finger"
 
 
 def outcome(distances, efforts):

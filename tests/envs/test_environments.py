@@ -201,7 +201,7 @@ def test_rows_choose_the_backend_and_make_vec_follows():
 def test_a_surrogate_without_weights_names_the_shipped_ones(identifier):
     from softgym_envs.errors import WeightsError
 
-    variant = make_robot(softgym_envs.ENVIRONMENTS[identifier].robot).weights_name
+    variant = make_robot(softgym_envs.ENVIRONMENTS[identifier].robot).learning.weights
     with pytest.raises(WeightsError, match=f"'{variant}'.*finger_1cable, finger_2cables"):
         gymnasium.make(identifier, backend="surrogate")
 

@@ -59,7 +59,7 @@ class Optioned(Spike):
 def test_class_attributes_and_one_method_are_enough():
     robot = Spike()
     assert robot.workspace_scale == 0.25 * 0.05
-    assert robot.weights_name == "spike"
+    assert robot.learning.weights == "spike"
     assert robot.mechanics_key == {"gravity": [0.0, 0.0, 0.0]}
     assert robot.effector_rest.shape == (3,)
     assert robot.effort_scale.dtype == float

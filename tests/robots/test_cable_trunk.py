@@ -152,12 +152,12 @@ def test_follows_its_circle(trunk):
 
 
 def test_attributes(trunk, coarse):
-    assert trunk.weights_name.startswith(trunk.name)
+    assert trunk.learning.weights.startswith(trunk.name)
     assert json.loads(json.dumps(trunk.mechanics_key)) == trunk.mechanics_key
     assert coarse.mechanics_key != trunk.mechanics_key
     np.testing.assert_allclose(trunk.upper, [0.035] * 4 + [0.020] * 4)
     np.testing.assert_allclose(make_robot("cable_trunk", strokes=(0.07, 0.04)).upper, [0.070] * 4 + [0.040] * 4)
-    assert make_robot("cable_trunk", gravity=(0.0, 0.0, -9.81)).stiffness_variable is None
+    assert make_robot("cable_trunk", gravity=(0.0, 0.0, -9.81)).learning.stiffness_variable is None
 
 
 @pytest.mark.parametrize(

@@ -55,8 +55,8 @@ def test_clamped_nodes_touch_nothing():
 
 
 def test_own_stiffness_does_not_scale_with_the_body():
-    assert make_robot("finger", obstacles=[WALL]).stiffness_variable == "young_modulus"
-    assert make_robot("finger", obstacles=[WALL], contact_stiffness=1e5).stiffness_variable is None
+    assert make_robot("finger", obstacles=[WALL]).learning.stiffness_variable == "young_modulus"
+    assert make_robot("finger", obstacles=[WALL], contact_stiffness=1e5).learning.stiffness_variable is None
 
 
 @pytest.mark.parametrize(

@@ -123,7 +123,7 @@ def test_without_gravity_stiffness_does_not_change_the_motion(diamond):
 
 def test_the_soft_heavy_body_of_the_published_scene_sags():
     robot = make_robot("diamond", gravity=(0.0, 0.0, -9.81))
-    assert robot.stiffness_variable is None
+    assert robot.learning.stiffness_variable is None
     state = Statics(robot.build({"young_modulus": 1.8e5})).solve(np.zeros(4), "effort")
     sag = robot.effector_rest - state.delta[4:]
     np.testing.assert_allclose(sag[:2], 0.0, atol=1e-9)

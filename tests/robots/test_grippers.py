@@ -297,7 +297,7 @@ def test_stiffness_scales_compliance_and_nothing_else(name):
     soft, stiff = (Statics(robot.build({"young_modulus": E})).solve(0.3 * COMMANDS[name]) for E in (2e6, 6e6))
     same = np.allclose(soft.condensed.compliance, 3.0 * stiff.condensed.compliance, rtol=1e-6, atol=1e-9)
     # Against the constant force of the button, the kinematics depends on stiffness, too.
-    assert same == (robot.stiffness_variable == "young_modulus") == (name != "press_finger")
+    assert same == (robot.learning.stiffness_variable == "young_modulus") == (name != "press_finger")
 
 
 def test_the_bar_may_be_longer_or_shorter():

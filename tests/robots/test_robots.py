@@ -32,7 +32,7 @@ def robot(request):
 @pytest.fixture(scope="module")
 def remeshing(robot):
     """The same robot, remeshing every design."""
-    options = next(o for n, o in VARIANTS if make_robot(n, **o).weights_name == robot.weights_name)
+    options = next(o for n, o in VARIANTS if make_robot(n, **o).learning.weights == robot.learning.weights)
     return make_robot(robot.name, **options, meshing="remesh")
 
 
@@ -72,13 +72,13 @@ def test_attributes(robot):
     assert np.shape(robot.effort_scale) == (count,)
     assert len({actuator.name for actuator in robot.actuators}) == count
     assert json.loads(json.dumps(robot.mechanics_key)) == robot.mechanics_key
-    assert robot.weights_name.startswith(robot.name)
-    assert robot.stiffness_variable is None or robot.stiffness_variable in robot.design_space.names
+    assert robot.learning.weights.startswith(robot.name)
+    assert robot.learning.stiffness_variable is None or robot.learning.stiffness_variable in robot.design_space.names
 
 
 def test_variants_have_their_own_weights_names_and_mechanics_keys():
     robots = [make_robot(name, **options) for name, options in VARIANTS]
-    assert len({r.weights_name for r in robots}) == len(robots)
+    assert len({r.learning.weights for r in robots}) == len(robots)
     assert len({json.dumps(r.mechanics_key, sort_keys=True) for r in robots}) == len(robots)
 
 
@@ -158,7 +158,7 @@ def test_the_reference_body_is_the_unmoved_mesh(robot):
 
 
 def test_the_same_design_gives_the_same_body_bit_for_bit(robot):
-    options = next(o for n, o in VARIANTS if make_robot(n, **o).weights_name == robot.weights_name)
+    options = next(o for n, o in VARIANTS if make_robot(n, **o).learning.weights == robot.learning.weights)
     design = robot.design_space.from_unit(np.linspace(-0.3, 0.4, len(robot.design_space)))
     first = robot.body(design)
     robot.body(robot.design_space.from_unit(np.linspace(0.5, -0.2, len(robot.design_space))))  # must leave no trace
@@ -219,7 +219,7 @@ def test_moving_the_mesh_is_far_smoother_than_remeshing(robot, remeshing):
 
 
 def test_stiffness_variable_scales_compliance_and_nothing_else(robot):
-    name = robot.stiffness_variable
+    name = robot.learning.stiffness_variable
     assert name is not None
     base = robot.design_space.baseline[name]
     soft, stiff = (rest_state(robot.build({name: f * base})) for f in (0.5, 2.0))
@@ -229,7 +229,7 @@ def test_stiffness_variable_scales_compliance_and_nothing_else(robot):
 
 def test_with_gravity_nothing_scales():
     robot = make_robot("finger", gravity=(0.0, 0.0, -9.81))
-    assert robot.stiffness_variable is None
+    assert robot.learning.stiffness_variable is None
     model = robot.build()
     assert model.loads.sum(axis=0)[2] == pytest.approx(-9.81 * 1100.0 * model.volume, rel=1e-9)
 

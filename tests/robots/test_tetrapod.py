@@ -304,7 +304,7 @@ def test_a_command_without_equilibrium_reports_the_reached_fraction(robot):
 
 
 def test_mechanics_key_and_options_that_change_it(robot):
-    assert robot.weights_name == "tetrapod"
+    assert robot.learning.weights == "tetrapod"
     assert robot.mechanics_key == {"payload": 0.0, "elements": 6, "gravity": [0.0, 0.0, -9.81]}
     assert make_robot("tetrapod", payload=0.5).mechanics_key != robot.mechanics_key
     path = robot.reference_path(12)

@@ -171,7 +171,7 @@ def test_tensors_are_judged_as_arrays(name, options):
     robot = make_robot(name, **options)
     model = pretrained_model(robot)
     domain: dict[str, object] = {"calibration": CALIBRATION, "limit": np.inf}
-    if len(robot.sensor_scale):  # learned for few of its dimensions: random bodies are outside the box
+    if len(robot.sensing.scale):  # learned for few of its dimensions: random bodies are outside the box
         domain["design"] = {}
     if model.domain.limits_growth:
         domain["growth"] = 4.0

@@ -123,7 +123,7 @@ def test_designs():
     designs = SamplingPlan(6, 1).designs(robot, 0, 6)
     for name, variable in space.variables.items():
         values = np.array([design[name] for design in designs])
-        if name == robot.stiffness_variable:
+        if name == robot.learning.stiffness_variable:
             assert (values == variable.baseline).all()
         else:
             assert len(set(values)) == 6 and values.min() >= variable.low and values.max() <= variable.high

@@ -84,7 +84,7 @@ def test_potential_is_a_potential_whatever_its_weights(name, rest):
     n = model.count
     scale = np.sqrt(np.abs(np.einsum("bii->bi", W)).mean(axis=0))
     least = np.linalg.eigvalsh(W / scale[:, None] / scale)[:, 0]
-    assert (least > 0.0).all() if robot.convex else (least < 0.0).any()
+    assert (least > 0.0).all() if robot.learning.convex else (least < 0.0).any()
     K = np.linalg.inv(W[:, :n, :n])
     J = np.swapaxes(np.linalg.solve(W[:, :n, :n], W[:, :n, n:]), 1, 2)
     h = 2e-3 * (robot.upper - robot.lower)
@@ -359,7 +359,7 @@ def test_card_records_the_origin_of_the_weights(cables):
     assert card["network"] in NETWORKS
     assert card["test"]["positive_definite"] == 1.0
     assert card["states"]["test"] >= 500
-    config = load_config(shipped_configs("surrogate")[robot.weights_name], FitConfig)
+    config = load_config(shipped_configs("surrogate")[robot.learning.weights], FitConfig)
     # How the data are generated does not count, and options that are newer than the weights had their defaults.
     known = FitConfig.model_validate({k: v for k, v in card["config"].items() if k != "workers"})
     apart = {"workers", "executor"}
@@ -588,7 +588,7 @@ def test_fit_of_three_fidelities(tmp_path):
     model = load_model(tmp_path / "model", robot)
     more = load_dataset(tmp_path / "data" / "more" / "train")
     train = load_dataset(tmp_path / "data" / "train")
-    images = 1 + len(robot.symmetries)
+    images = 1 + len(robot.learning.symmetries)
     assert model.card["states"]["train"] == images * (len(train["rest"]) + len(more["rest"]))
     assert model.card["states"]["pretraining/train"] > 150 and model.card["correction"]["states"] == 3
     features = model.features.design(levels[1]["design"])

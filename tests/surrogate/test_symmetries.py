@@ -22,7 +22,7 @@ def test_images_are_equilibria_of_the_exchanged_commands(name):
     options, command = ROBOTS[name]
     robot = make_robot(name, **options)
     model, rows = robot.build(), []
-    commands = [np.array(command), *(np.array(command)[symmetry.order] for symmetry in robot.symmetries)]
+    commands = [np.array(command), *(np.array(command)[symmetry.order] for symmetry in robot.learning.symmetries)]
     for each in commands:
         state = Statics(model).solve(each).condensed
         rows.append(
@@ -62,4 +62,4 @@ def test_a_robot_that_is_not_symmetric_has_no_images(name, options):
 
 
 def test_weight_along_the_axis_keeps_the_symmetries():
-    assert len(make_robot("diamond", gravity=(0.0, 0.0, -9.81)).symmetries) == 7
+    assert len(make_robot("diamond", gravity=(0.0, 0.0, -9.81)).learning.symmetries) == 7

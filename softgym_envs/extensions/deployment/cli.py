@@ -66,7 +66,8 @@ def deploy(
     if design and files and controller is None and all(file.suffix == ".onnx" for file in files):
         raise ConfigError("--design applies to C headers (.h) only: an .onnx graph takes the design as an input")
     body = options.robot_of(robot, options_)
-    learned = body.touch_variant()
+    touch = body.learning.touch
+    learned = body if touch is None else touch.variant()
     model = pretrained_model(learned, weights)
     chosen = options.design_of(design)
     for file in files:

@@ -29,7 +29,7 @@ def exportable(model: SurrogateModel, members: int | None) -> Model:
     """
     if not isinstance(model, Model):
         raise ValueError(f"a model of network '{model.network}' cannot be exported; allowed: 'potential'")
-    if not model.robot.convex:
+    if not model.robot.learning.convex:
         raise ValueError(f"robot '{model.robot.name}' cannot be exported: its energy is not convex")
     return model if members is None else Model(model.robot, model.tensors, model.card, members)
 

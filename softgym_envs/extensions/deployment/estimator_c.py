@@ -81,13 +81,14 @@ def _loads(estimator: LearnedEstimator, grid: TouchGrid) -> tuple[np.ndarray, np
         ValueError: if the design does not depend linearly on force and indices.
     """
     robot, space = estimator.robot, estimator.model.robot.design_space
-    names = estimator.model.robot.load_variables
+    names, learned = estimator.model.robot.learning.loads, robot.learning.touch
+    assert learned is not None  # the estimator refuses other robots
     columns = [space.names.index(name) for name in names]
     untouched = space.complete(estimator.design).array
 
     def design(force: float, first: float, second: float) -> np.ndarray:
         point = np.array(grid.corner) + grid.pitch * (first * np.array(grid.along) + second * np.array(grid.across))
-        touch = robot.touch_design(estimator.design, point, force * np.array(grid.normal))
+        touch = learned.design(estimator.design, point, force * np.array(grid.normal))
         found = untouched.copy()
         found[columns] = [touch[name] for name in names]
         return found
@@ -147,7 +148,7 @@ def _header(estimator: LearnedEstimator, grid: TouchGrid, expected_force: float,
         f"Estimator of a touched soft robot, written by softgym-envs {__version__} (C99, estimator header format 2):",
         "thesis, sec. 3.3.6, on a learned model: shape, force and place of a touch from volumes of cavities.",
         "",
-        f"Robot      {robot.name} ({model.robot.weights_name})",
+        f"Robot      {robot.name} ({model.robot.learning.weights})",
         *(
             f"{'Design' if i == 0 else '':10s} {key} = {estimator.design[key]!r}"
             for i, key in enumerate(estimator.design)

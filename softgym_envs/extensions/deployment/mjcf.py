@@ -312,7 +312,7 @@ def _document(chain: Chain, largest: np.ndarray, damping: float) -> str:
     for number, (link, origin) in enumerate(zip(chain.links, origins, strict=True)):
         label = f"{name}_{number}"
         before = origins[number - 1] if number else np.zeros(3)
-        bodies.append(f"<body name={quoteattr(label)} pos=\"{_numbers(origin - before)}\">")
+        bodies.append(f'<body name={quoteattr(label)} pos="{_numbers(origin - before)}">')
         inertia = link.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
         pose = f'pos="{_numbers(link.centre - origin)}" mass="{link.mass:.8g}"'
         bodies.append(f'<inertial {pose} fullinertia="{_numbers(inertia)}"/>')
@@ -342,7 +342,7 @@ def _document(chain: Chain, largest: np.ndarray, damping: float) -> str:
     bodies.extend("</body>" for _ in chain.links)
     tendons, motors = [], []
     for (cable, (points, _)), bound in zip(chain.cables.items(), largest, strict=True):
-        sites = "".join(f'<site site={quoteattr(f"{name}_{cable}_{index}")}/>' for index in range(len(points)))
+        sites = "".join(f"<site site={quoteattr(f'{name}_{cable}_{index}')}/>" for index in range(len(points)))
         tendons.append(f"<spatial name={quoteattr(cable)}>{sites}</spatial>")
         motors.append(
             f'<motor name={quoteattr(cable)} tendon={quoteattr(cable)} gear="-1" ctrlrange="0 {bound:.8g}" '

@@ -152,7 +152,7 @@ def header_text(model: Model, given: Mapping[str, float] | None, name: str, robo
     about = [
         f"Condensed model of a soft robot, written by softgym-envs {__version__} (C99, header format 1).",
         "",
-        f"Robot      {robot.name} ({robot.weights_name})",
+        f"Robot      {robot.name} ({robot.learning.weights})",
         f"Options    {json.dumps(robot.mechanics_key)}",
         *(f"{'Design' if k == 0 else '':10s} {key} = {design[key]!r}{units[key]}" for k, key in enumerate(design)),
         *(

@@ -108,7 +108,7 @@ def _describe(graph: Any, model: Model, onnx: Any) -> None:
     """Add the description and the metadata to a graph."""
     robot = model.robot
     graph.producer_name, graph.producer_version = "softgym-envs", __version__
-    graph.graph.name = robot.weights_name
+    graph.graph.name = robot.learning.weights
     graph.doc_string = (
         "Condensed model of a soft robot: efforts that hold its actuators at given displacements, effector positions "
         "[m], and the compliance W of actuators and effectors. SI units."
@@ -119,7 +119,7 @@ def _describe(graph: Any, model: Model, onnx: Any) -> None:
     ]
     properties = {
         "robot": robot.name,
-        "weights_name": robot.weights_name,
+        "weights_name": robot.learning.weights,
         "mechanics_key": json.dumps(robot.mechanics_key),
         "design": json.dumps(variables),
         "displacement": json.dumps(actuator_records(model)),

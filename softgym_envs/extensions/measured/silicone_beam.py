@@ -18,6 +18,7 @@ from softgym_envs.designs import DesignSpace, DesignVariable
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.actuator import Actuator
 from softgym_envs.robots.base import Robot
+from softgym_envs.robots.capabilities import Learning
 from softgym_envs.robots.mesh_tiers import choose_mesh
 
 LENGTH, WIDTH, HEIGHT = 0.100, 0.030, 0.030
@@ -46,6 +47,7 @@ class SiliconeBeam(Robot):
     name = "silicone_beam"
     effectors = tuple(MARKERS)
     size = LENGTH
+    learning = Learning(loads=("tip_load",))
 
     def __init__(
         self,
@@ -67,10 +69,6 @@ class SiliconeBeam(Robot):
         self.effector_rest = np.array(MARKERS["top"])
         self.effort_scale = np.array([1.0])
         self.actuators = (Actuator("thread", 0.0, 0.03, 0.002),)
-
-    @property
-    def load_variables(self) -> tuple[str, ...]:
-        return ("tip_load",)
 
     def assemble(self, design: Mapping[str, float]) -> MechanicalModel:
         """Mesh the box, clamp its far end, load the edge, put effectors where the markers are."""

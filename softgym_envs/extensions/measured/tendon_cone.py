@@ -18,6 +18,7 @@ from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.actuator import Actuator
 from softgym_envs.robots.base import Robot
+from softgym_envs.robots.capabilities import Learning
 from softgym_envs.robots.mesh_tiers import choose_mesh
 
 LONG, SHORT = 0.305, 0.055
@@ -53,7 +54,7 @@ class TendonCone(Robot):
     name = "tendon_cone"
     effectors = tuple(MARKERS)
     size = LONG + SHORT
-    convex = False  # beyond a quarter turn, a tendon shortens faster than its tension grows
+    learning = Learning(convex=False)  # beyond a quarter turn, a tendon shortens faster than its tension grows
 
     def __init__(
         self, *, mesh: str = "coarse", gravity: tuple[float, float, float] = (0.0, 0.0, -9.81), **options: Any

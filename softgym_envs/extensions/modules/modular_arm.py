@@ -22,6 +22,7 @@ from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.skins import box_skin, bridge_skin
 from softgym_envs.robots.base import Actuator, Robot
+from softgym_envs.robots.capabilities import Learning
 
 _QUARTER_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
@@ -114,6 +115,7 @@ class ModularArm(Robot):
     name = "modular_arm"
     effectors = ("tip",)
     size = 0.1
+    learning = Learning(stiffness_variable="young_modulus")
 
     def __init__(
         self,
@@ -144,7 +146,6 @@ class ModularArm(Robot):
         if body not in BODIES:
             raise ValueError(unknown_name("body", body, BODIES))
         super().__init__(**options)
-        self.stiffness_variable = None if any(self.gravity) else "young_modulus"
         self.cells = cells if isinstance(cells, int) else tuple(cells)
         self._kinds = (*kinds, NONE)
         self.body = body

@@ -30,7 +30,7 @@ class EstimatedQPAgent(InverseQPAgent):
             raise ValueError(f"agent 'qp_estimated' needs a task that shows sensors; '{env.task.name}' does not")
         super()._begin(env)
         # A tenth of a percent stands for the differences between touches of the plant and of the estimator.
-        level = max(env.plant.noise, 1e-3) * float(np.mean(env.robot.sensor_scale))
+        level = max(env.plant.noise, 1e-3) * float(np.mean(env.robot.sensing.scale))
         # A body has sensors of one kind; the other level is not used.
         noise = Noise(displacement=1e-5, volume=level, pressure=level)
         if isinstance(env.backend, SurrogateBackend):
@@ -46,6 +46,6 @@ class EstimatedQPAgent(InverseQPAgent):
         load = None if task.touched is None else Touch(task.grid, task.touched, task.largest_force)
         if load != estimator.load:
             estimator.touch(load)
-        found = estimator.update(estimator.reading(present, env.sensed.sensors * env.robot.sensor_scale))
+        found = estimator.update(estimator.reading(present, env.sensed.sensors * env.robot.sensing.scale))
         aim = env.observed_goal + found.condensed.delta.e[:3] - found.effector[:3]
         return controller.solve(found.condensed, aim, present, found.slack)

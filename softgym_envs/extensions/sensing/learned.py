@@ -1,6 +1,6 @@
 """Estimation of a touch on a learned model, which evaluates every place of a cell at once.
 
-The model has force and place of a touch among its inputs (`Robot.touch_variant`). So the equilibrium at each place and
+The model has force and place of a touch among its inputs (`LearnedTouch`). So the equilibrium at each place and
 force is its own, not extrapolated from another place: at each place, Gauss-Newton finds the most probable errors of the
 actuators and force. The answer to the actuators is the learned ``W``; the answer to the force is the change of the
 model under held actuators, after which ``W`` puts slack ones back to no effort. The sum over places is that of
@@ -132,7 +132,7 @@ class LearnedEstimator:
         design: missing variables take their baseline.
         load: the touch; None while nothing is touched.
         noise: of sensors and actuators; loads do not drift, and efforts are not read.
-        model: the learned model of ``robot.touch_variant()``; default the shipped one.
+        model: the learned model of ``robot.learning.touch.variant()``; default the shipped one.
         exact: whether the body is the learned model itself, so that its errors do not count.
         errors: of the model on this body, from `measured_errors`, for effectors and then sensors; default those on the
             many bodies that the weights were validated on.
@@ -167,14 +167,16 @@ class LearnedEstimator:
         self.steps, self.accuracy = steps, accuracy
         if self.noise.drift or self.noise.effort is not None:
             raise ValueError(f"the estimator on a learned model supports neither drift nor efforts, got {self.noise}")
-        if robot.touch_variant() is robot:
+        touch = robot.learning.touch
+        if touch is None:
             raise ValueError(f"no touch of robot '{robot.name}' is learned; use Estimator")
-        self.model = model or pretrained_model(robot.touch_variant())
+        self.model = model or pretrained_model(touch.variant())
+        self._touched_design = touch.design
         self.design = robot.design_space.complete(design)
         space = self.model.robot.design_space
         self._body = np.array([{**space.baseline, **self.design}[name] for name in space.names])
         # The first load variable is the force, which the others do not depend on.
-        self._loads = self.model.robot.load_variables
+        self._loads = self.model.robot.learning.loads
         self._columns = [space.names.index(name) for name in self._loads]
         cavities = robot.build(self.design).constraints["s"]
         self.rest_volumes = np.array([row.rest_volume for row in cavities if isinstance(row, Cavity)])
@@ -185,8 +187,8 @@ class LearnedEstimator:
         elif errors is None:
             if "errors" not in self.model.card:
                 raise WeightsError(
-                    f"the card of the weights of '{self.model.robot.weights_name}' has no 'errors': fit them again, or "
-                    "pass errors=measured_errors(...)"
+                    f"the card of the weights of '{self.model.robot.learning.weights}' has no 'errors': fit them "
+                    "again, or pass errors=measured_errors(...)"
                 )
             # Of the rows of the model, those of touched points are left out.
             own, touched = np.arange(self._own), self.model.effectors - self._own
@@ -221,7 +223,7 @@ class LearnedEstimator:
             coordinates, shares = cell_nodes(PLACES)
             self._places, size = Places(coordinates, np.zeros((len(shares), 0)), shares), load.expected_force
             points, normal = load.grid.inside(load.cell, coordinates), np.array(load.grid.normal)
-            touches = [self.robot.touch_design(self.design, point, normal) for point in points]
+            touches = [self._touched_design(self.design, point, normal) for point in points]
             self._touches = np.array([[touch[name] for name in self._loads] for touch in touches])
         self._known = _Known(Mixture.before_readings(self._places, known, size))
 

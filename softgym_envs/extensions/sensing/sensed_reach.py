@@ -43,7 +43,7 @@ class SensedReach(Reach):
         **options: object,
     ) -> None:
         super().__init__(robot, command_low=command_low, **options)  # type: ignore[arg-type]
-        if not len(robot.sensor_scale):
+        if not len(robot.sensing.scale):
             raise ValueError(f"task '{self.name}' needs a robot with sensors, but robot '{robot.name}' has none")
         if not (np.isfinite(force) and force >= 0.0):
             raise ValueError(f"force = {force} N must be non-negative and finite")
@@ -56,8 +56,8 @@ class SensedReach(Reach):
         self.axes = np.abs(np.array(self.grid.normal))
         self.largest_force, self.window = force, window
         self.touches = force > 0.0
-        each = len(robot.actuators) + len(robot.sensor_scale)
-        self.history, self.sensors = history, len(robot.sensor_scale) + 3 + (history - 1) * each
+        each = len(robot.actuators) + len(robot.sensing.scale)
+        self.history, self.sensors = history, len(robot.sensing.scale) + 3 + (history - 1) * each
         self._readings: list[np.ndarray] = []
         self.touched: Cell | None = None
         self._load, self._first = PointForce(np.zeros(3), np.zeros(3)), 0
@@ -80,7 +80,7 @@ class SensedReach(Reach):
 
     def sensor_readings(self, state: State) -> np.ndarray:
         """Return the changes of the cavities' volumes, or their pressures, over their scale, shape (s,)."""
-        return state.condensed.delta.s / self.robot.sensor_scale
+        return state.condensed.delta.s / self.robot.sensing.scale
 
     def touch_readings(self) -> np.ndarray:
         """Return whether a cell is touched (1 or -1), and its place along both axes of the grid (-1 to 1, or 0)."""

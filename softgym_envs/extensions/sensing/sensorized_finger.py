@@ -22,6 +22,7 @@ from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.mechanics.surfaces import check_cavities
 from softgym_envs.robots.base import TOUCH_RADIUS, Actuator, MeshedRobot
+from softgym_envs.robots.capabilities import LearnedTouch, Learning, Sensing
 from softgym_envs.robots.geometry.finger_shape import (
     THICKNESS,
     check_finger,
@@ -162,43 +163,20 @@ class SensorizedFinger(MeshedRobot):
             DesignVariable("young_modulus", 1.0e6, 1.0e7, 3.0e6, "Pa", "stiffness of the silicone", log=True),
             DesignVariable("poisson_ratio", 0.30, 0.499, 0.30, "1", "0.5 is incompressible"),
         )
-        self.sealed = sealed
-        # The stiffness of air does not scale with that of the material.
-        self.stiffness_variable = None if any(self.gravity) or sealed else "young_modulus"
+        self.learning = Learning(
+            weights=f"{self.name}_{cavities}cavities" + "_sealed" * sealed + "_touched" * touch,
+            stiffness_variable="young_modulus",
+            loads=("touch_force", "touch_below", "touch_beside") if touch else (),
+            touch=None if touch else TouchOnBack(self),
+        )
         self.tip_height = float(tip_height)
         self.cable_clearance = float(cable_clearance)
         self.effector_rest = np.array([0.0, self.tip_height, -3.0 * LENGTH * mm])
         self.effort_scale = np.array([20.0])
         # What a pull of 10 mm does to each cavity of the baseline body: its volume [m3] or its pressure [Pa] changes.
         volume, pressure = (57e-9, 7.4e3) if cavities == 2 else (23e-9, 6.5e3)
-        self.sensor_scale = np.full(cavities, pressure if sealed else volume)
-        self.sensor_unit = "Pa" if sealed else "m3"
+        self.sensing = Sensing(np.full(cavities, pressure if sealed else volume), "Pa" if sealed else "m3", sealed)
         self.actuators = (Actuator("cable", 0.0, 0.015, 0.001, unilateral=unilateral),)
-
-    @property
-    def weights_name(self) -> str:
-        """``sensorized_finger_2cavities`` or ``..._4cavities``, then ``_sealed`` and ``_touched`` if they are."""
-        name = f"sensorized_finger_{self.cavities}cavities"
-        return name + "_sealed" * self.sealed + "_touched" * self.touch
-
-    @property
-    def load_variables(self) -> tuple[str, ...]:
-        return ("touch_force", "touch_below", "touch_beside") if self.touch else ()
-
-    def touch_variant(self) -> SensorizedFinger:
-        if self.touch:
-            return self
-        # A network is smooth in the design, so it learns a mesh that moves with it. At the baseline both are one.
-        return SensorizedFinger(**{**self._options, "touch": True, "meshing": "morph"})  # type: ignore[arg-type]
-
-    def touch_design(self, design: Mapping[str, float], point: np.ndarray, force: np.ndarray) -> dict[str, float]:
-        x, y, z = map(float, point)
-        if abs(y) > 1e-6 or force[0] != 0.0 or force[2] != 0.0:
-            raise ValueError(
-                f"a learned touch is a force along y on the back (y = 0), got {list(force)} N at {list(point)} m"
-            )
-        share = self.design_space["young_modulus"].baseline / design["young_modulus"]
-        return {"touch_force": float(force[1]) * share, "touch_below": -z, "touch_beside": x}
 
     # -- shape ------------------------------------------------------------------------------------------------------
 
@@ -280,7 +258,7 @@ class SensorizedFinger(MeshedRobot):
             np.add.at(model.nodal_loads[:, 1], touched.node_ids[0], force * touched.weights[0])
         for number, triangles in enumerate(mesh.cavities(), start=1):
             cavity = model.cavity(f"cavity_{number}", triangles)
-            model.add("s", model.seal(cavity) if self.sealed else cavity)
+            model.add("s", model.seal(cavity) if self.sensing.sealed else cavity)
         return model
 
     def readings(
@@ -331,6 +309,31 @@ class SensorizedFinger(MeshedRobot):
             tension=float(state.effort[0]),
             stable=state.stable,
         )
+
+
+class TouchOnBack(LearnedTouch):
+    """A force on the flat back of a `SensorizedFinger`.
+
+    Args:
+        robot: the finger without a touch among its design variables.
+    """
+
+    def __init__(self, robot: SensorizedFinger) -> None:
+        self._robot = robot
+
+    def variant(self) -> SensorizedFinger:
+        # A network is smooth in the design, so it learns a mesh that moves with it. At the baseline both are one.
+        options: dict[str, Any] = {**self._robot._options, "touch": True, "meshing": "morph"}
+        return SensorizedFinger(**options)
+
+    def design(self, design: Mapping[str, float], point: np.ndarray, force: np.ndarray) -> dict[str, float]:
+        x, y, z = map(float, point)
+        if abs(y) > 1e-6 or force[0] != 0.0 or force[2] != 0.0:
+            raise ValueError(
+                f"a learned touch is a force along y on the back (y = 0), got {list(force)} N at {list(point)} m"
+            )
+        share = self._robot.design_space["young_modulus"].baseline / design["young_modulus"]
+        return {"touch_force": float(force[1]) * share, "touch_below": -z, "touch_beside": x}
 
 
 def _volumes(model: MechanicalModel, readings: np.ndarray) -> np.ndarray:

@@ -135,7 +135,7 @@ def generate_dataset(
             "displacement": [a.name for a in body.actuators],
             "effort": [a.name for a in body.actuators],
             "effector": [f"{e} {axis}" for e in body.effectors for axis in "xyz"]
-            + [f"sensor {k + 1}" for k in range(len(body.sensor_scale))],
+            + [f"sensor {k + 1}" for k in range(len(body.sensing.scale))],
             "compliance": "upper triangle of W over actuators then effectors, row by row",
         },
     }

@@ -48,7 +48,7 @@ class SamplingPlan:
         boundary: share of the groups whose designs and commands lie on faces, edges and vertices of their boxes, where
             optimisers end; commands at a vertex leave cables slack (see `pushed`).
         share: part of the ranges of the commands, from their lower ends, that is drawn from.
-        loads: groups in a row that share a body and differ in what acts on it (`Robot.load_variables`): a mesh costs
+        loads: groups in a row that share a body and differ in what acts on it (`Learning.loads`): a mesh costs
             more than the states under one more load.
         one_mesh: leave out bodies to which the mesh of the baseline does not move well: their own meshes have errors of
             their own, which no smooth function of the design describes.
@@ -132,7 +132,7 @@ class SamplingPlan:
         ends = np.array(box).reshape(-1, 2)
         points = self.unit_points(len(names) + bool(self.alike), first, count, self.groups, 0)
         if self.loads > 1:
-            body = [k for k, name in enumerate(names) if name not in robot.load_variables]
+            body = [k for k, name in enumerate(names) if name not in robot.learning.loads]
             for row in range(count):
                 shared = self.unit_points(points.shape[1], (first + row) // self.loads, 1, self.groups, 0)
                 points[row, body] = shared[0, body]
@@ -208,7 +208,7 @@ def solve_path(
     def solve(command: np.ndarray) -> Equilibrium | None:
         try:
             found = statics.solve(command)
-            if not robot.convex or may_be_joined(start, found):
+            if not robot.learning.convex or may_be_joined(start, found):
                 return found
             statics.restore(start.x, start.effort)
             steps, before = int(np.ceil((np.abs(command - begun) / rates).max())), start

@@ -78,14 +78,14 @@ def full_compliance(upper: np.ndarray, size: int) -> np.ndarray:
 
 
 def with_images(robot: Robot, data: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return a dataset, followed by the images of its states under each symmetry of the robot (`Robot.symmetries`)."""
+    """Return a dataset, followed by the images of its states under each of the robot's `Learning.symmetries`."""
     data = dict(data)
-    if not robot.symmetries:
+    if not robot.learning.symmetries:
         return data
     count, coordinates = data["effort"].shape[1], data["effector"].shape[1]
     size = count + coordinates
     W, upper, parts = full_compliance(data["compliance"], size), np.triu_indices(size), [data]
-    for symmetry in robot.symmetries:
+    for symmetry in robot.learning.symmetries:
         turn = np.zeros((size, size))
         turn[np.arange(count), symmetry.order] = 1.0
         turn[count:, count:] = symmetry.rows(coordinates // 3)
@@ -107,8 +107,8 @@ def stable_rows(robot: Robot, data: Mapping[str, np.ndarray]) -> np.ndarray:
     States whose W is not positive definite are unstable even with their actuators held (volume-driven chambers can
     buckle). States whose compliance between actuators is more than `GROWTH` times that at rest, in any direction, are
     about to buckle: W is nearly singular there, and a smooth model cannot represent that. All states of a body that is
-    unstable at rest are left out. For robots whose energy is not convex (`Robot.convex`), states that are stable only
-    while their actuators are held are included.
+    unstable at rest are left out. For robots whose energy is not convex (`Learning.convex`), states that are stable
+    only while their actuators are held are included.
 
     Raises:
         DataError: if the dataset does not begin with a state at rest.
@@ -125,13 +125,13 @@ def stable_rows(robot: Robot, data: Mapping[str, np.ndarray]) -> np.ndarray:
     scale = np.sqrt(np.abs(np.einsum("bii->bi", W)).mean(axis=0))
     rest_of = np.flatnonzero(rest)[np.cumsum(rest) - 1]
     convex = np.linalg.eigvalsh((W / scale[:, None] / scale)[:, a, a])[:, 0] > 1e-9
-    stable = convex if robot.convex else convex[rest_of]
+    stable = convex if robot.learning.convex else convex[rest_of]
     # The compliance with held actuators may be zero (in rigid directions) but not negative.
     held = W[:, e, e] - W[:, e, a] @ np.linalg.solve(W[:, a, a], W[:, a, e])
     least = np.linalg.eigvalsh(0.5 * (held + held.swapaxes(1, 2)))[:, 0]
     stable &= least > -1e-6 * np.einsum("bii->b", W[:, e, e])
     stable &= stable[rest_of]
-    if not robot.convex:
+    if not robot.learning.convex:
         return stable
     C = np.linalg.cholesky(W[rest_of][stable][:, a, a])
     half = np.linalg.solve(C, W[stable][:, a, a])

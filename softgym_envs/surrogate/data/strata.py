@@ -131,7 +131,7 @@ def strata_of(robot: Robot, *, buckles: bool) -> tuple[str, ...]:
         buckles: whether it can buckle.
     """
     missing = set()
-    if robot.unilateral.sum() < 2 or not robot.convex:
+    if robot.unilateral.sum() < 2 or not robot.learning.convex:
         missing.add("slack corners")
     if not buckles:
         missing.add("near buckling")
@@ -280,7 +280,7 @@ def _solve_body(robot: Robot, commands: Commands, number: int, second_start: boo
     )
     try:
         statics = Statics(robot.build(design))
-        if not robot.convex:
+        if not robot.learning.convex:
             statics.unilateral = np.zeros(count, dtype=bool)
         rest = statics.solve(np.zeros(count), robot.rest_mode)
         if robot.rest_mode == "effort" and statics.model.loads.any():
@@ -297,7 +297,7 @@ def _solve_body(robot: Robot, commands: Commands, number: int, second_start: boo
         if second_start:
             found = _from_rest(statics, rest, wanted[k], found)
         growth = growth_of(rest, found)
-        if robot.convex and growth == np.inf:
+        if robot.learning.convex and growth == np.inf:
             continue
         if second_start:
             part.apart[k] = np.abs(found.condensed.delta.e - other.condensed.delta.e).max()
@@ -309,7 +309,7 @@ def _solve_body(robot: Robot, commands: Commands, number: int, second_start: boo
     for name in ("displacement", "effort", "effector", "slack", "touching", "growth", "apart", "found"):
         getattr(part, name)[:] = getattr(part, name)[source]
     for k in np.flatnonzero(image >= 0):
-        symmetry = robot.symmetries[image[k]]
+        symmetry = robot.learning.symmetries[image[k]]
         for name in ("displacement", "effort", "slack"):
             getattr(part, name)[k] = getattr(part, name)[k][symmetry.order]
         part.effector[k] = symmetry.positions(part.effector[k])
@@ -320,14 +320,14 @@ def _repeated(robot: Robot, commands: np.ndarray) -> tuple[np.ndarray, np.ndarra
     """Return which commands (n, n_a) need no solution of their own.
 
     Returns:
-        For each command, the number of the first that is equal to it or has it as an image (`Robot.symmetries`), its
+        For each command, the number of the first that is equal to it or has it as an image (`Learning.symmetries`), its
         own if there is none before; and the number of that symmetry, -1 for none.
     """
     source, image = np.arange(len(commands)), np.full(len(commands), -1)
     for k, command in enumerate(commands):
         for first in range(k):
             before = commands[first]
-            alike = [before, *(before[symmetry.order] for symmetry in robot.symmetries)]
+            alike = [before, *(before[symmetry.order] for symmetry in robot.learning.symmetries)]
             found = next((i for i, other in enumerate(alike) if np.array_equal(command, other)), None)
             if found is not None:
                 source[k], image[k] = first, found - 1

@@ -17,9 +17,9 @@ et al. 2017, arXiv:1609.07152), ``x`` is a plain network, and ``C = L L^T``. The
 * d delta / d effort of the surrogate is its own W: control and design work with exact derivatives;
 * cables that cannot push have one solution: the minimum of ``U`` over the displacements beyond their commands.
 
-For a robot whose energy is not convex (`Robot.convex`) the quadratic part of ``U`` may have any sign: a convex function
-plus such a quadratic can represent every smooth function on the box of displacements. ``W`` is then still the exact
-derivative, but positive definite only where the body is stable.
+For a robot whose energy is not convex (`Learning.convex`) the quadratic part of ``U`` may have any sign: a convex
+function plus such a quadratic can represent every smooth function on the box of displacements. ``W`` is then still the
+exact derivative, but positive definite only where the body is stable.
 
 Every FEM state teaches values and first derivatives of efforts and effectors (through W_aa and W_ea), so few states are
 needed. The layers of the design are separate from those of the actuation and are evaluated once per body. An ensemble
@@ -126,7 +126,7 @@ class Model(SurrogateModel):
             body[name] = np.logaddexp(np.float32(0.0), body[name] - np.float32(SHIFT))
         lower = np.tril_indices(n)
         factor, entries = np.zeros((rows, M, n, n), dtype=np.float32), body["quadratic"]
-        if self.robot.convex:
+        if self.robot.learning.convex:
             factor[:, :, lower[0], lower[1]] = np.where(lower[0] == lower[1], np.exp(entries), entries)
             quadratic = factor @ factor.swapaxes(2, 3)
         else:

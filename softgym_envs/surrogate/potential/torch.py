@@ -65,7 +65,7 @@ class PotentialEnsemble:
         tensors = {
             name: torch.as_tensor(np.asarray(value), dtype=torch.float64) for name, value in model.tensors.items()
         }
-        ensemble = cls(tensors, tensors.get("rest"), model.robot.convex)
+        ensemble = cls(tensors, tensors.get("rest"), model.robot.learning.convex)
 
         def put(tensor: Tensor) -> Tensor:
             return tensor.to(device=device, dtype=dtype).contiguous()

@@ -74,8 +74,8 @@ def train(
         middle = 0.5 * (robot.upper + robot.lower)
         rest = (0.0 - middle) / (robot.upper - middle)
     weights = np.ones(training.effector.shape[1], dtype=np.float32)
-    weights[len(weights) - len(robot.sensor_scale) :] = options.sensor_weight
-    shared = data, rest, robot.convex, weights / weights.mean()
+    weights[len(weights) - len(robot.sensing.scale) :] = options.sensor_weight
+    shared = data, rest, robot.learning.convex, weights / weights.mean()
     arguments = [(trainer, member, *shared, states[member]) for member in range(options.members)]
     found = sorted(parallel_map(_train_member, arguments, trainer.workers), key=lambda result: result[0])
     return stack_members([state for _, state, _ in found], scales), {f"member {k}": rows for k, _, rows in found}
@@ -188,9 +188,11 @@ def make_targets(robot: Robot, states: States, scales: dict[str, np.ndarray]) ->
     a, c = slice(0, n), slice(n, None)
     half = 0.5 * (robot.upper - robot.lower)
     W_aa = states.W[:, a, a] / half[:, None] / half * scales["energy"]
-    metric_of = np.arange(len(states)) if robot.convex else states.rest_of
+    metric_of = np.arange(len(states)) if robot.learning.convex else states.rest_of
     S = np.linalg.cholesky(0.5 * (W_aa + W_aa.swapaxes(1, 2))[metric_of])
-    hessian = np.broadcast_to(np.eye(n), W_aa.shape) if robot.convex else S.swapaxes(1, 2) @ np.linalg.inv(W_aa) @ S
+    hessian = (
+        np.broadcast_to(np.eye(n), W_aa.shape) if robot.learning.convex else S.swapaxes(1, 2) @ np.linalg.inv(W_aa) @ S
+    )
     J = np.linalg.solve(states.W[:, a, a], states.W[:, a, c]).swapaxes(1, 2)
     W_ee = states.W[:, c, c] / scales["held"]
     size = W_ee.shape[1]

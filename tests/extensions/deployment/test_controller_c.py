@@ -39,7 +39,7 @@ int qp(double *H, const double *g, const double *low, const double *high, double
 """
 FLAGS = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror", "-O2"]
 ROBOTS = {k: make_robot(name, **options) for k, (name, options) in shipped_robots().items()}
-CONVEX = {k: v for k, v in shipped_robots().items() if ROBOTS[k].convex and not len(ROBOTS[k].sensor_scale)}
+CONVEX = {k: v for k, v in shipped_robots().items() if ROBOTS[k].learning.convex and not ROBOTS[k].sensing}
 
 
 def pointers(*arrays):

@@ -267,7 +267,7 @@ def test_the_command_line_writes_both(tmp_path, monkeypatch, softgym):
 def test_the_header_of_a_robot_with_sensors_has_its_effectors(tmp_path):
     """The model of a touched finger has a touched point and sensors, which the header of the finger leaves out."""
     robot = make_robot("sensorized_finger")
-    model = pretrained_model(robot.touch_variant(), members=1)
+    model = pretrained_model(robot.learning.touch.variant(), members=1)
     design = {"joint_height": 0.0063, "young_modulus": 2.4e6}
     compiled = Compiled(export_c(model, design, tmp_path / "model.h", name="finger", robot=robot))
     displacement = np.linspace(0.0, 0.012, 7)[:, None]

@@ -149,7 +149,7 @@ def test_stiffness_scales_the_torque_and_nothing_else(robot):
     soft, stiff = (Statics(robot.build({"young_modulus": e})).solve([0.3]) for e in (2e6, 4e6))
     assert stiff.effort[0] == pytest.approx(2.0 * soft.effort[0], rel=1e-9)
     np.testing.assert_allclose(stiff.delta[1:], soft.delta[1:], atol=1e-12)
-    assert make_robot("contact_aided_finger", gravity=(0.0, 0.0, -9.81)).stiffness_variable is None
+    assert make_robot("contact_aided_finger", gravity=(0.0, 0.0, -9.81)).learning.stiffness_variable is None
 
 
 def test_published_mesh_is_stiffer_than_the_accurate_one():

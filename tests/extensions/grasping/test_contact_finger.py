@@ -58,7 +58,7 @@ def test_an_unknown_component_is_rejected():
 
 def test_attributes(finger):
     robot, model = finger
-    assert robot.weights_name == robot.name == "contact_finger"
+    assert robot.learning.weights == robot.name == "contact_finger"
     assert [a.name for a in robot.actuators] == [
         "finger_1_cable_1",
         "finger_1_cable_2",
@@ -151,8 +151,8 @@ def test_W_is_the_derivative_of_the_equilibrium(finger, state):
 
 def test_stiffness_scales_efforts_and_nothing_else(state):
     robot = make_robot("contact_finger", mesh_size=MESH_SIZE, unilateral=False)
-    assert robot.stiffness_variable == "young_modulus"
-    assert make_robot("contact_finger", gravity=(0.0, 0.0, -9.81)).stiffness_variable is None
+    assert robot.learning.stiffness_variable == "young_modulus"
+    assert make_robot("contact_finger", gravity=(0.0, 0.0, -9.81)).learning.stiffness_variable is None
     stiff = Statics(robot.build({"young_modulus": 6.0e6})).solve(COMMAND)
     np.testing.assert_allclose(stiff.effort[:8], 2.0 * state.effort[:8], rtol=1e-5)
     np.testing.assert_allclose(stiff.condensed.delta.e, state.condensed.delta.e, atol=1e-9)

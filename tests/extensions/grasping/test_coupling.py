@@ -244,7 +244,7 @@ def contact_finger():
 def test_contacts_are_an_option_that_changes_nothing_else(contact_finger):
     robot, model, _ = contact_finger
     plain = make_robot("finger", unilateral=False)
-    assert robot.weights_name == plain.weights_name
+    assert robot.learning.weights == plain.learning.weights
     assert robot.mechanics_key == {**plain.mechanics_key, "contacts": True}
     assert model.roles == (("a", 2), ("e", 3), ("c", 9))
     assert [c.name for c in model.constraints["c"]] == ["contact_1", "contact_2", "contact_3"]

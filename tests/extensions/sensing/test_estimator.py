@@ -66,10 +66,10 @@ def test_readings_without_noise_lead_to_the_truth(case):
     load[1:] = 0.0  # the middle of the cell, which is the most probable place
     near = estimator.linearise(command, load)
     readings, _ = estimator.predict(near, command, load)
-    count = len(estimator.robot.sensor_scale)
+    count = len(estimator.robot.sensing.scale)
     estimator.touch(estimator.load)
     efforts = readings[count:] if len(readings) > count else None
-    sealed = estimator.robot.sealed
+    sealed = estimator.robot.sensing.sealed
     cavities = {"pressures" if sealed else "volumes": readings[:count]}
     found = estimator.update(Readings(command, efforts=efforts, **cavities))
     assert found.converged

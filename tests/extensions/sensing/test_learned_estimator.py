@@ -104,8 +104,9 @@ def test_a_push_that_slackens_the_cable_is_found_from_small_forces(robot):
 
 
 def test_errors_of_the_model_keep_the_truth_of_finite_elements_likely(robot):
-    load = robot.touch_design(robot.design_space.baseline, POINT, np.array([0.0, 0.8, 0.0]))
-    state = Statics(robot.touch_variant().build(load)).solve(COMMAND)
+    touch = robot.learning.touch
+    load = touch.design(robot.design_space.baseline, POINT, np.array([0.0, 0.8, 0.0]))
+    state = Statics(touch.variant().build(load)).solve(COMMAND)
     estimator = touched(robot, exact=False)
     assert (estimator.errors.deviation > 0.0).all()
     found = estimator.update(Readings(COMMAND, estimator.rest_volumes + state.condensed.delta.s))

@@ -48,7 +48,7 @@ def test_observations_hold_sensors_and_no_effector():
     np.testing.assert_allclose(observation[spaces.slices["sensors"]], [0.0, 0.0, -1.0, 0.0, 0.0], atol=1e-12)
     observation, *_ = env.step(np.ones(1))
     first, second, felt, across, along = observation[spaces.slices["sensors"]]
-    change = env.unwrapped.state.condensed.delta.s / env.unwrapped.robot.sensor_scale
+    change = env.unwrapped.state.condensed.delta.s / env.unwrapped.robot.sensing.scale
     np.testing.assert_allclose([first, second], change / (1.0 + np.abs(change)), rtol=1e-6)
     assert felt == 1.0
     centres = task.grid.corners(task.touched).mean(axis=0)

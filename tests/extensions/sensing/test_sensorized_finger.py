@@ -121,7 +121,7 @@ def test_sealed_cavities_show_pressures_and_stiffen_the_finger(robot, readings):
     assert np.abs(statics.solve([0.0]).condensed.delta.s).max() < 1e-6
     state = statics.solve([0.010])
     pressures = state.condensed.delta.s
-    np.testing.assert_allclose(pressures, sealed.sensor_scale, rtol=0.05)
+    np.testing.assert_allclose(pressures, sealed.sensing.scale, rtol=0.05)
     found = sealed.readings()
     np.testing.assert_allclose((ATMOSPHERE + pressures) * found.pulled_volumes, ATMOSPHERE * np.array(found.volumes))
     assert found.relative_volume_change == pytest.approx(pressures[0] / ATMOSPHERE)
@@ -129,7 +129,7 @@ def test_sealed_cavities_show_pressures_and_stiffen_the_finger(robot, readings):
     step = 1e-3
     low, high = (statics.solve([state.effort[0] + s * step], "effort").condensed.delta.s for s in (-1, 1))
     np.testing.assert_allclose(state.condensed.W.sa[:, 0], (high - low) / (2 * step), rtol=1e-4)
-    assert sealed.stiffness_variable is None and sealed.weights_name.endswith("_sealed")
+    assert sealed.learning.stiffness_variable is None and sealed.learning.weights.endswith("_sealed")
     with pytest.raises(ValueError, match="sealed air"):
         Plants.check({"stiffness": 1.2}, sealed, "fem")
 
@@ -184,7 +184,7 @@ def test_options_move_the_tip_and_the_cable():
     assert high.bending_angle < plain.bending_angle
     assert high.tension < plain.tension
     hanging = make_robot("sensorized_finger", gravity=(0.0, 0.0, -9.81))
-    assert hanging.stiffness_variable is None
+    assert hanging.learning.stiffness_variable is None
     assert hanging.readings().bending_angle < plain.bending_angle
 
 

@@ -35,7 +35,7 @@ def test_sensors_and_touch_agree_with_finite_elements(robot):
         assert learned.condensed.roles == solved.condensed.roles
         assert learned.effector.shape == solved.effector.shape
         assert np.abs(learned.effector - solved.effector).max() < 2e-3
-        assert np.abs(learned.condensed.delta.s - solved.condensed.delta.s).max() < 0.1 * robot.sensor_scale[0]
+        assert np.abs(learned.condensed.delta.s - solved.condensed.delta.s).max() < 0.1 * robot.sensing.scale[0]
         W, truth = learned.condensed.W, solved.condensed.W
         assert W.sa == pytest.approx(truth.sa, rel=0.2)
         assert W.ea[1:] == pytest.approx(truth.ea[1:], rel=0.2)
@@ -75,7 +75,7 @@ def test_stiffness_scales_efforts_of_a_touched_body_alone():
 
 def test_groups_share_a_body_under_several_touches():
     robot = make_robot("sensorized_finger", touch=True)
-    plan = SamplingPlan(6, 1, sequence="random", loads=3, vary=("outer_radius", *robot.load_variables))
+    plan = SamplingPlan(6, 1, sequence="random", loads=3, vary=("outer_radius", *robot.learning.loads))
     designs = plan.designs(robot, 0, 6)
     radii, forces = ([d[name] for d in designs] for name in ("outer_radius", "touch_force"))
     assert radii[0] == radii[1] == radii[2] != radii[3] == radii[4] == radii[5]

@@ -247,7 +247,7 @@ def load_chain(robot: Robot, folder: str | Path | None = None) -> ChainModel:
         WeightsError: if a file is missing, damaged, of another kind or for another robot.
         ValueError: for a robot that cannot be a chain.
     """
-    folder = WEIGHTS / robot.weights_name if folder is None else Path(folder)
+    folder = WEIGHTS / robot.learning.weights if folder is None else Path(folder)
     card, tensors = read_weights(folder, robot)
     if card.get("network") != NETWORK:
         raise WeightsError(f"weights '{folder}' have network {json.dumps(card.get('network'))}, needed '{NETWORK}'")

@@ -219,7 +219,7 @@ def domain_of(
         "design": {
             n: [float(c.min()), float(c.max())]
             for n, c in zip(names, training["design"].T, strict=True)
-            if n != model.robot.stiffness_variable
+            if n != model.robot.learning.stiffness_variable
         },
         "inflation": float(np.quantile((error / spread)[found.found], 0.95)),
         "limit": float(np.quantile(spread, 0.98)),

@@ -29,6 +29,7 @@ from softgym_envs.mechanics.contact.obstacles import Obstacle
 from softgym_envs.mechanics.elements.quadratic import add_midside_nodes
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Actuator, Drawing, MeshedRobot
+from softgym_envs.robots.capabilities import Learning, View
 from softgym_envs.robots.geometry.meshing import BodyMesh, mesh_geometry
 from softgym_envs.robots.geometry.morphing import Feature
 from softgym_envs.robots.mesh_tiers import MeshTier
@@ -69,15 +70,15 @@ class ContactAidedFinger(MeshedRobot):
     name = "contact_aided_finger"
     effectors: tuple[str, ...] = ("tip",)
     size = 0.1
-    picture_axes = (2, 0, 1)  # it stands along y and closes along x
+    view = View(axes=(2, 0, 1))  # it stands along y and closes along x
     goal_axes = np.array([1.0, 1.0, 0.0])
     rest_mode = "displacement"
-    convex = False
+    learning = Learning(stiffness_variable="young_modulus", convex=False)
     backends = {
         "surrogate": "softgym_envs.extensions.grasping.backends.chain:ChainBackend",
         "hybrid": "softgym_envs.extensions.grasping.backends.hybrid_chain:HybridChainBackend",
     }
-    always_touches = True  # `evaluate_grasp` adds the object
+    may_touch = True  # `evaluate_grasp` adds the object
     meshes = {
         "published": MeshTier(3.0e-3),
         "accurate": MeshTier(8.0e-3, "quadratic"),
@@ -128,7 +129,6 @@ class ContactAidedFinger(MeshedRobot):
             DesignVariable("young_modulus", 1.0e6, 1.0e7, 3.62e6, "Pa", "stiffness of the print", log=True),
             DesignVariable("poisson_ratio", 0.40, 0.499, 0.452, "1", "0.5 is incompressible"),
         )
-        self.stiffness_variable = None if any(gravity) else "young_modulus"
         self.effector_rest = self.tip(self.design_space.baseline)
         self.effort_scale = np.array([0.3])
         self.actuators = (

@@ -22,6 +22,7 @@ from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.constraints.pose import Pose
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Actuator
+from softgym_envs.robots.capabilities import Learning
 from softgym_envs.robots.grippers import STRAIGHT, FingerRobot
 from softgym_envs.robots.soft_finger import TIP_RADIUS
 
@@ -42,7 +43,7 @@ class ContactFinger(FingerRobot):
     effectors = ("tip",)
     placements = ((STRAIGHT, (0.0, 0.0, 0.0)),)
     cable_range = (-0.002, 0.020)
-    convex = False
+    learning = Learning(stiffness_variable="young_modulus", convex=False)
     #: Name, smallest and largest value, and unit of the coordinates of the pose.
     pose_ranges = (
         ("x", -0.009, 0.009, "m"),

@@ -26,6 +26,7 @@ from softgym_envs.mechanics.contact.obstacles import Obstacle, Plane
 from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Actuator, Robot
+from softgym_envs.robots.capabilities import Learning, View
 
 CLOSING_RATE = math.radians(2.0)
 """Largest change of a servo's angle in a control step [rad]."""
@@ -119,8 +120,8 @@ class ContactAidedGripper(Robot):
     effectors = ("box",)
     size = 0.1
     rest_mode = "displacement"
-    convex = False
-    free_object = True
+    learning = Learning(convex=False)
+    view = View(at_rest=True)
     backends = {
         "surrogate": "softgym_envs.extensions.grasping.backends.chain_hand:ChainHandBackend",
         "hybrid": "softgym_envs.extensions.grasping.backends.hybrid_chain:HybridHandBackend",
