@@ -8,8 +8,7 @@ import numpy as np
 from softgym_envs import DesignSpace, DesignVariable
 from softgym_envs.control import InverseQP
 from softgym_envs.mechanics import MechanicalModel
-from softgym_envs.robots import Actuator, Robot
-from softgym_envs.robots.capabilities import Learning
+from softgym_envs.robots import Actuator, Learning, Robot
 
 
 def bar(layers):

@@ -8,7 +8,6 @@ if TYPE_CHECKING:
     from softgym_envs.extensions.grasping.control.contact_control import ContactControl as ContactControl
     from softgym_envs.extensions.grasping.control.contact_qp import ContactQP as ContactQP
     from softgym_envs.extensions.grasping.control.contact_qp import ForceGoal as ForceGoal
-    from softgym_envs.extensions.grasping.control.coupling import HeldObject as HeldObject
     from softgym_envs.extensions.grasping.control.finger_models import SurrogateFingers as SurrogateFingers
     from softgym_envs.extensions.grasping.control.fingers import CoupledFingers as CoupledFingers
     from softgym_envs.extensions.grasping.control.manipulation import Manipulation as Manipulation
@@ -20,7 +19,6 @@ __getattr__, __dir__, __all__ = lazy_exports(
     {
         "control.contact_control": ["ContactControl"],
         "control.contact_qp": ["ContactQP", "ForceGoal"],
-        "control.coupling": ["HeldObject"],
         "control.finger_models": ["SurrogateFingers"],
         "control.fingers": ["CoupledFingers"],
         "control.manipulation": ["Manipulation"],
