@@ -22,6 +22,7 @@ from softgym_envs.mechanics.elements.rigid import box_inertia
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.skins import box_skin, tube_skin
 from softgym_envs.robots.base import Actuator, Robot
+from softgym_envs.robots.capabilities import View
 
 LEGS = {"front_left": (1.0, 1.0), "front_right": (1.0, -1.0), "rear_left": (-1.0, 1.0), "rear_right": (-1.0, -1.0)}
 """Sides of the legs, along x and y."""
@@ -57,7 +58,7 @@ class Quadruped(Robot):
     made_of_beams = True
     goal_axes = np.array([1.0, 1.0, 0.0])
     goal_tolerance = 0.01
-    picture_axes = (1, 2, 0)
+    view = View(axes=(1, 2, 0))
     workspace_scale = 0.04
 
     def __init__(

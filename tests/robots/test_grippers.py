@@ -12,8 +12,7 @@ import pytest
 
 from softgym_envs import make_robot
 from softgym_envs.errors import DesignError
-from softgym_envs.extensions.grasping import HeldObject
-from softgym_envs.extensions.grasping.control.coupling import couple, rotate, tie_points
+from softgym_envs.extensions.grasping.control.coupling import HeldObject, couple, rotate, tie_points
 from softgym_envs.mechanics.frames import rotation_of
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.soft_finger import SoftFinger

@@ -7,8 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from softgym_envs import make_robot
-from softgym_envs.extensions.grasping import HeldObject
-from softgym_envs.extensions.grasping.control.coupling import couple, rotate, tie_points
+from softgym_envs.extensions.grasping.control.coupling import HeldObject, couple, rotate, tie_points
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics

@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from softgym_envs import make_robot
 from softgym_envs.control import InverseQP
-from softgym_envs.extensions.grasping import HeldObject, Manipulation
-from softgym_envs.extensions.grasping.control.coupling import rotate
+from softgym_envs.extensions.grasping import Manipulation
+from softgym_envs.extensions.grasping.control.coupling import HeldObject, rotate
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.solvers.statics import Statics
 
