@@ -1,7 +1,6 @@
 """Co-design: Optuna proposes bodies, each is scored with its controller, and the best are checked on FEM.
 
-`run_study` runs a study, `write_report` writes its report, and `load_study` reads what it has found so far. `search`,
-`optimise`, `analyse_sensitivity` and `calibrate` work on bodies without a controller.
+`run_study` runs a study, `write_report` writes its report, and `load_study` reads what it has found so far.
 """
 
 from typing import TYPE_CHECKING
@@ -10,21 +9,12 @@ from softgym_envs._lazy import lazy_exports
 
 if TYPE_CHECKING:
     from softgym_envs.codesign.config import StudyConfig as StudyConfig
-    from softgym_envs.codesign.metrics.courses import ActuationPath as ActuationPath
     from softgym_envs.codesign.metrics.metric import Metric as Metric
     from softgym_envs.codesign.metrics.metric import metric as metric
     from softgym_envs.codesign.metrics.sources import Outcome as Outcome
     from softgym_envs.codesign.report.page import write_report as write_report
     from softgym_envs.codesign.snapshot import load_study as load_study
     from softgym_envs.codesign.study import run_study as run_study
-    from softgym_envs.codesign.tools.calibration import calibrate as calibrate
-    from softgym_envs.codesign.tools.config import CalibrationConfig as CalibrationConfig
-    from softgym_envs.codesign.tools.config import OptimiseConfig as OptimiseConfig
-    from softgym_envs.codesign.tools.config import SensitivityConfig as SensitivityConfig
-    from softgym_envs.codesign.tools.gradient import optimise as optimise
-    from softgym_envs.codesign.tools.measurements import measure as measure
-    from softgym_envs.codesign.tools.search import search as search
-    from softgym_envs.codesign.tools.sensitivity import analyse_sensitivity as analyse_sensitivity
 
 if __name__ != "softgym_envs.codesign":  # this folder is softgym_envs/codesign, by a link
     raise ImportError(f"the package is softgym_envs.codesign: import that in place of {__name__}")
@@ -33,17 +23,10 @@ __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
     {
         "config": ["StudyConfig"],
-        "metrics.courses": ["ActuationPath"],
         "metrics.metric": ["Metric", "metric"],
         "metrics.sources": ["Outcome"],
         "report.page": ["write_report"],
         "snapshot": ["load_study"],
         "study": ["run_study"],
-        "tools.calibration": ["calibrate"],
-        "tools.config": ["CalibrationConfig", "OptimiseConfig", "SensitivityConfig"],
-        "tools.gradient": ["optimise"],
-        "tools.measurements": ["measure"],
-        "tools.search": ["search"],
-        "tools.sensitivity": ["analyse_sensitivity"],
     },
 )

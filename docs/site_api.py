@@ -24,6 +24,7 @@ PACKAGES = {
     "softgym_envs.viewer": "Pictures",
     "softgym_envs.agents": "Agents",
     "softgym_envs.codesign": "Co-design",
+    "softgym_envs.extensions.design": "Extension: design without a controller",
     "softgym_envs.extensions.grasping": "Extension: grasping",
     "softgym_envs.extensions.modules": "Extension: compliant modules",
     "softgym_envs.extensions.sensing": "Extension: sensing",

@@ -341,8 +341,8 @@ def test_malformed_files(softgym, tmp_path, text):
     [
         ("softgym_envs.agents.training", "train", ["train", "--config", CONFIG, "--folder", "x"], True),
         ("softgym_envs.agents.evaluation", "evaluate", ["evaluate", "--config", CONFIG, "--goals", "1"], False),
-        ("softgym_envs.codesign.tools.search", "search", ["optimise", "--config", FRONT], True),
-        ("softgym_envs.codesign.tools.gradient", "optimise", ["optimise", "--config", STRENGTH], False),
+        ("softgym_envs.extensions.design.gradient_free", "search", ["optimise", "--config", FRONT], True),
+        ("softgym_envs.extensions.design.gradient", "optimise", ["optimise", "--config", STRENGTH], False),
     ],
 )
 def test_an_interrupted_command_says_whether_it_can_continue(

@@ -32,9 +32,9 @@ LAYERS = [
     {"softgym_envs.codesign"},
     {"softgym_envs.viewer", "softgym_envs.testing"},
     {"softgym_envs.cli"},
-    # Extensions: no core package imports one. The first ones do not know each other.
+    # Extensions: no core package imports one. Those of one layer do not know each other.
+    {"softgym_envs.extensions", "softgym_envs.extensions.design"},
     {
-        "softgym_envs.extensions",
         "softgym_envs.extensions.grasping",
         "softgym_envs.extensions.leaderboard",
         "softgym_envs.extensions.learners",

@@ -19,6 +19,7 @@ PACKAGES = [
     "softgym_envs.control",
     "softgym_envs.envs",
     "softgym_envs.extensions.deployment",
+    "softgym_envs.extensions.design",
     "softgym_envs.extensions.grasping",
     "softgym_envs.extensions.leaderboard",
     "softgym_envs.extensions.modules",
@@ -136,7 +137,7 @@ def test_examples_use_public_paths(example):
 
 def test_the_checker_sees_private_paths():
     page = """
-        Text with `softgym_envs.robots.Robot.build`, `softgym_envs.codesign.tools.Absent`
+        Text with `softgym_envs.robots.Robot.build`, `softgym_envs.extensions.design.Absent`
         and `softgym_envs.errors.DataError`.
 
     ```python title="arm.py"
@@ -158,5 +159,5 @@ def test_the_checker_sees_private_paths():
         "softgym_envs.robots.make_robot",
         "softgym_envs.errors.unknown_name",
         "benchmarks.speed",
-        "softgym_envs.codesign.tools.Absent",
+        "softgym_envs.extensions.design.Absent",
     ]

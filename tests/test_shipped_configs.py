@@ -8,9 +8,9 @@ import yaml
 
 from softgym_envs.agents.config import TrainConfig
 from softgym_envs.cli import options
-from softgym_envs.codesign.tools.config import CalibrationConfig
 from softgym_envs.config import load_config, shipped_configs
 from softgym_envs.errors import ConfigError
+from softgym_envs.extensions.design.config import CalibrationConfig
 
 ROOT = Path(__file__).resolve().parent.parent
 CALIBRATION = ROOT / "configs" / "design" / "finger_calibration.yaml"

@@ -17,11 +17,11 @@ from softgym_envs.agents.config import EnvironmentConfig, TrainConfig
 from softgym_envs.agents.evaluation import evaluate
 from softgym_envs.agents.policy import Policy
 from softgym_envs.backends import make_backend
-from softgym_envs.codesign import measure
 from softgym_envs.codesign.config import StudyConfig
-from softgym_envs.codesign.tools.config import CalibrationConfig, OptimiseConfig
 from softgym_envs.config import load_config
 from softgym_envs.errors import SoftGymError
+from softgym_envs.extensions.design import measure
+from softgym_envs.extensions.design.config import CalibrationConfig, OptimiseConfig
 from softgym_envs.extensions.sensing.loads import Payload, Touch, finger_grid
 from softgym_envs.extensions.sensing.readings import Noise
 from softgym_envs.mechanics import MechanicalModel

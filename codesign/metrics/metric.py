@@ -196,19 +196,13 @@ class _Metrics(Table):
         return found
 
 
-_MODULES = {
-    "episodes": (
-        *("success_rate", "mean_distance", "mean_return", "mean_tracking_distance", "mean_effort", "untrusted_share"),
-        "material_volume",
-    ),
-    "courses": (
-        *("bending_angle", "angular_displacement", "contact_force", "normal_force", "grasp_resistance", "travel"),
-        *("manipulability", "tip_stiffness", "effort", "work"),
-    ),
-}
+_NAMES = (
+    *("success_rate", "mean_distance", "mean_return", "mean_tracking_distance", "mean_effort", "untrusted_share"),
+    "material_volume",
+)
 METRICS: Mapping[str, Metric] = _Metrics(
     "metric",
-    {name: f"softgym_envs.codesign.metrics.{module}:{name}" for module, names in _MODULES.items() for name in names},
+    {name: f"softgym_envs.codesign.metrics.episodes:{name}" for name in _NAMES},
     group="softgym_envs.metrics",
 )
 """Registry: name to metric."""

@@ -19,8 +19,8 @@ class Source:
 
     Args:
         name: identifier.
-        read: returns the argument of the functions for an `softgym_envs.codesign.tools.bodies.Body` (or, where a
-            controller is evaluated, an `Outcome`).
+        read: returns the argument of the functions for a body: an `Outcome` where a
+            controller is evaluated, else what an extension evaluates.
         refuse: returns what a robot or a backend lacks for it, as in "metric 'x' needs ..."; empty if it lacks nothing.
         settings: makes and checks the settings of the source, which a configuration gives as plain data in ``sources``;
             called with None for the default ones. None for a source without settings.
@@ -62,7 +62,7 @@ EPISODES = Source(
 )
 """A body and the evaluation of its controller, an `Outcome`."""
 STATES = Source("states", lambda body: body.course)
-"""States of a batch of bodies from rest to the full command, a `metrics.courses.ActuationPath`."""
+"""States of a batch of bodies from rest to the full command, with gradients on a surrogate."""
 BODY = Source("body", lambda body: body.model)
 """The mechanical model of a body, a `softgym_envs.mechanics.model.MechanicalModel`."""
 DESIGN = Source("design", lambda body: dict(body.design))

@@ -43,9 +43,6 @@ SECTIONS = {
     "Design and control": {
         "demo": "demo:demo",
         "codesign": "codesign:codesign",
-        "optimise": "codesign:optimise",
-        "sensitivity": "codesign:sensitivity",
-        "calibrate": "codesign:calibrate",
     },
     "Configurations": {
         "configs": "configs:configs",

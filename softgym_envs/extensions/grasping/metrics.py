@@ -16,7 +16,7 @@ from softgym_envs.extensions.grasping.grasps import Grasp, GraspObject, evaluate
 from softgym_envs.extensions.grasping.robots.contact_aided_finger import ContactAidedFinger
 
 if TYPE_CHECKING:
-    from softgym_envs.codesign.tools.bodies import Body
+    from softgym_envs.extensions.design.bodies import Body
     from softgym_envs.robots.base import Robot
 
 

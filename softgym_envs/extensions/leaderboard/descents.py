@@ -13,9 +13,9 @@ import torch
 from scipy.stats import qmc
 from torch import Tensor
 
-from softgym_envs.codesign.tools.bodies import learned_model
-from softgym_envs.codesign.tools.box import Box
-from softgym_envs.codesign.tools.gradient import descend
+from softgym_envs.extensions.design.bodies import learned_model
+from softgym_envs.extensions.design.box import Box
+from softgym_envs.extensions.design.gradient import descend
 from softgym_envs.extensions.leaderboard.clock import working_seconds
 from softgym_envs.extensions.leaderboard.frozen import FrozenProblem
 from softgym_envs.extensions.leaderboard.problem import Score

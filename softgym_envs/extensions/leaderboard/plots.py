@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.agents.statistics import interquartile_mean
-from softgym_envs.codesign.tools.plots import STYLE
+from softgym_envs.extensions.design.plots import STYLE
 from softgym_envs.extensions.leaderboard.frozen import load_problem, problem_names
 from softgym_envs.extensions.leaderboard.problem import BenchmarkProblem
 from softgym_envs.extensions.leaderboard.regret import EQUAL, Contest, Stored, contests

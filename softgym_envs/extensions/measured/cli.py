@@ -20,7 +20,7 @@ def validate(robot: str, data: Path | None, page: Path | None) -> None:
     Robots: silicone_beam, tendon_cone, tendon_rod. Nothing is downloaded.
     """
     require("measured")
-    from softgym_envs.codesign.tools.fit_page import write_page
+    from softgym_envs.extensions.design.fit_page import write_page
     from softgym_envs.extensions.measured.comparison import find_source
 
     source = find_source(robot)

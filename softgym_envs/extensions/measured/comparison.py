@@ -8,8 +8,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from softgym_envs.codesign.tools.fit_page import Page
 from softgym_envs.errors import DataError, unknown_name
+from softgym_envs.extensions.design.fit_page import Page
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from softgym_envs.codesign.tools.fit_page import Page, Picture, Table, drawn
-from softgym_envs.codesign.tools.plots import BASELINE, WINNER
+from softgym_envs.extensions.design.fit_page import Page, Picture, Table, drawn
+from softgym_envs.extensions.design.plots import BASELINE, WINNER
 from softgym_envs.extensions.measured.comparison import SOURCES, Comparison, Line, files_in, numbers
 from softgym_envs.extensions.measured.recordings import read_c3d, rigid_motion
 from softgym_envs.extensions.measured.silicone_beam import MESHES, SiliconeBeam

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from softgym_envs.codesign.tools.calibration import calibrate, fitted_units, predicted
-from softgym_envs.codesign.tools.config import CalibrationConfig
-from softgym_envs.codesign.tools.fit_page import Page, Picture, Table, drawn, parameter_table, residual_picture
-from softgym_envs.codesign.tools.measurements import Measurements
-from softgym_envs.codesign.tools.plots import BASELINE, WINNER
 from softgym_envs.config import check_config
+from softgym_envs.extensions.design.calibration import calibrate, fitted_units, predicted
+from softgym_envs.extensions.design.config import CalibrationConfig
+from softgym_envs.extensions.design.fit_page import Page, Picture, Table, drawn, parameter_table, residual_picture
+from softgym_envs.extensions.design.measurements import Measurements
+from softgym_envs.extensions.design.plots import BASELINE, WINNER
 from softgym_envs.extensions.measured.comparison import SOURCES, Comparison, Line, files_in
 from softgym_envs.extensions.measured.recordings import read_table
 

@@ -16,7 +16,7 @@ from softgym_envs.mechanics.surfaces import check_cavities
 from softgym_envs.units import Display
 
 if TYPE_CHECKING:
-    from softgym_envs.codesign.tools.bodies import Body
+    from softgym_envs.extensions.design.bodies import Body
     from softgym_envs.robots.base import Robot
 
 VOLUME_NOISE = 0.5e-9

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from softgym_envs import make_robot
-from softgym_envs.codesign.tools.bodies import Evaluator
-from softgym_envs.codesign.tools.config import OptimiseConfig, SensitivityConfig
-from softgym_envs.codesign.tools.evaluation import evaluate
 from softgym_envs.config import load_config
 from softgym_envs.errors import ConfigError, ConvergenceError, InfeasibleDesign
+from softgym_envs.extensions.design.bodies import Evaluator
+from softgym_envs.extensions.design.config import OptimiseConfig, SensitivityConfig
+from softgym_envs.extensions.design.evaluation import evaluate
 from softgym_envs.extensions.grasping.metrics import GraspConfig
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs" / "design"

@@ -10,13 +10,13 @@ import pytest
 
 from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
-from softgym_envs.codesign.tools.calibration import calibrate, make_misfit
-from softgym_envs.codesign.tools.config import CalibrationConfig
-from softgym_envs.codesign.tools.measurements import Measurements, read_measurements, write_measurements
-from softgym_envs.codesign.tools.nuisance import make_instrument
 from softgym_envs.config import check_config
 from softgym_envs.envs.plant import play
 from softgym_envs.errors import DataError
+from softgym_envs.extensions.design.calibration import calibrate, make_misfit
+from softgym_envs.extensions.design.config import CalibrationConfig
+from softgym_envs.extensions.design.measurements import Measurements, read_measurements, write_measurements
+from softgym_envs.extensions.design.nuisance import make_instrument
 
 COLUMNS = [f"cable_{k}_displacement" for k in (1, 2)]
 TRUTH = {"gain": 0.93, "zero": 6e-4, "play": 8e-4, "stretch": 3e-4, "turn_x": 0.05, "turn_z": -0.08, "shift_y": 0.003}

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from softgym_envs import make_robot
-from softgym_envs.codesign.tools import calibration, gradient
-from softgym_envs.codesign.tools import search as module
-from softgym_envs.codesign.tools.box import Box
-from softgym_envs.codesign.tools.config import CalibrationConfig, OptimiseConfig, SensitivityConfig
-from softgym_envs.codesign.tools.search import search
-from softgym_envs.codesign.tools.sensitivity import analyse_sensitivity, morris, one_at_a_time, sample, sobol
 from softgym_envs.config import check_config, load_config
 from softgym_envs.errors import ConfigError, ConvergenceError, InfeasibleDesign
+from softgym_envs.extensions.design import calibration, gradient
+from softgym_envs.extensions.design import gradient_free as module
+from softgym_envs.extensions.design.box import Box
+from softgym_envs.extensions.design.config import CalibrationConfig, OptimiseConfig, SensitivityConfig
+from softgym_envs.extensions.design.gradient_free import search
+from softgym_envs.extensions.design.sensitivity import analyse_sensitivity, morris, one_at_a_time, sample, sobol
 from softgym_envs.storage import read_signed, write_signed
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs" / "design"
@@ -54,7 +54,7 @@ class Stub:
 
 @pytest.fixture
 def stub(monkeypatch):
-    monkeypatch.setattr("softgym_envs.codesign.tools.config.BodiesConfig.evaluator", lambda *arguments: Stub())
+    monkeypatch.setattr("softgym_envs.extensions.design.config.BodiesConfig.evaluator", lambda *arguments: Stub())
     monkeypatch.setattr(Stub, "count", 0)
     monkeypatch.setattr(Stub, "stop", np.inf)
     return Stub

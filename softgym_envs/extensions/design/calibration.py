@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from softgym_envs.codesign.tools.config import CalibrationConfig
-from softgym_envs.codesign.tools.fit_page import calibration_page, write_page
-from softgym_envs.codesign.tools.measurements import Measurements, read_measurements
-from softgym_envs.codesign.tools.misfit import FEMMisfit, LearnedMisfit, Misfit
-from softgym_envs.codesign.tools.parameters import Parameters
-from softgym_envs.codesign.tools.plots import draw_calibration
-from softgym_envs.codesign.tools.records import CalibrationResult, Fit
 from softgym_envs.errors import ConfigError, ConvergenceError, InfeasibleDesign
+from softgym_envs.extensions.design.config import CalibrationConfig
+from softgym_envs.extensions.design.fit_page import calibration_page, write_page
+from softgym_envs.extensions.design.measurements import Measurements, read_measurements
+from softgym_envs.extensions.design.misfit import FEMMisfit, LearnedMisfit, Misfit
+from softgym_envs.extensions.design.parameters import Parameters
+from softgym_envs.extensions.design.plots import draw_calibration
+from softgym_envs.extensions.design.records import CalibrationResult, Fit
 from softgym_envs.runs import RunFolder, provenance
 from softgym_envs.storage import write_json
 from softgym_envs.wording import counted

@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from softgym_envs.codesign.tools.box import Box
-from softgym_envs.codesign.tools.instrument import Instrument
-from softgym_envs.codesign.tools.measurements import columns_of
-from softgym_envs.codesign.tools.nuisance import ContactConfig, Nuisances, OffsetConfig, make_instrument
+from softgym_envs.extensions.design.box import Box
+from softgym_envs.extensions.design.instrument import Instrument
+from softgym_envs.extensions.design.measurements import columns_of
+from softgym_envs.extensions.design.nuisance import ContactConfig, Nuisances, OffsetConfig, make_instrument
 from softgym_envs.robots.base import Robot
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.codesign.metrics.metric import Metric
-from softgym_envs.codesign.tools.records import CalibrationResult
+from softgym_envs.extensions.design.records import CalibrationResult
 from softgym_envs.storage import atomic_write
 from softgym_envs.units import display
 from softgym_envs.wording import counted

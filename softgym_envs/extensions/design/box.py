@@ -19,7 +19,7 @@ class Box:
 
     Logarithmic variables are uniform in their logarithm. A *design* here also has the values of free robot options, as
     ``robot.<option>``. The arguments after ``space`` are keys of
-    `softgym_envs.codesign.tools.config.BodiesConfig`.
+    `softgym_envs.extensions.design.config.BodiesConfig`.
 
     Raises:
         DesignError: for an unknown name, or a value or a bound outside the robot's own bounds.

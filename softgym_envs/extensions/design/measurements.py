@@ -14,8 +14,8 @@ import numpy as np
 
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.backends.registry import make_backend
-from softgym_envs.codesign.tools.contact import Plane, step_towards_plane
 from softgym_envs.errors import DataError, unknown_name
+from softgym_envs.extensions.design.contact import Plane, step_towards_plane
 from softgym_envs.robots.base import Robot
 from softgym_envs.storage import atomic_write
 

@@ -14,11 +14,11 @@ from torch import Tensor
 from softgym_envs.backends.backend import Backend, State
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.backends.registry import make_backend
-from softgym_envs.codesign.metrics.courses import ActuationPath
 from softgym_envs.codesign.metrics.metric import Metric, find_metric
 from softgym_envs.codesign.metrics.sources import STATES
 from softgym_envs.codesign.variables import split_values
 from softgym_envs.errors import ConfigError
+from softgym_envs.extensions.design.metrics import ActuationPath
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.potential.model import Model

@@ -8,12 +8,12 @@ import pytest
 
 from softgym_envs import make_robot
 from softgym_envs.codesign.metrics.metric import METRICS, Metric, find_metric, metric
-from softgym_envs.codesign.tools.bodies import Evaluator
-from softgym_envs.codesign.tools.config import BodiesConfig, ObjectiveConfig, OptimiseConfig, SensitivityConfig
-from softgym_envs.codesign.tools.search import search
-from softgym_envs.codesign.tools.sensitivity import analyse_sensitivity
 from softgym_envs.config import check_config, load_config
 from softgym_envs.errors import ConfigError
+from softgym_envs.extensions.design.bodies import Evaluator
+from softgym_envs.extensions.design.config import BodiesConfig, ObjectiveConfig, OptimiseConfig, SensitivityConfig
+from softgym_envs.extensions.design.gradient_free import search
+from softgym_envs.extensions.design.sensitivity import analyse_sensitivity
 
 BODIES = {
     "robot": "finger",

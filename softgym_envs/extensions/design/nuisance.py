@@ -12,10 +12,10 @@ from typing import Literal
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from softgym_envs.codesign.tools.instrument import Instrument
-from softgym_envs.codesign.tools.measurements import columns_of
 from softgym_envs.config import Config
 from softgym_envs.errors import unknown_name
+from softgym_envs.extensions.design.instrument import Instrument
+from softgym_envs.extensions.design.measurements import columns_of
 from softgym_envs.robots.base import Robot
 from softgym_envs.units import effort_unit
 

@@ -10,17 +10,17 @@ import pytest
 from click.testing import CliRunner
 
 from softgym_envs import make_robot
-from softgym_envs.cli.codesign import calibrate as calibrate_command
-from softgym_envs.codesign.tools.box import Box
-from softgym_envs.codesign.tools.calibration import calibrate, make_misfit
-from softgym_envs.codesign.tools.config import CalibrationConfig
-from softgym_envs.codesign.tools.contact import Plane
-from softgym_envs.codesign.tools.measurements import measure, write_measurements
-from softgym_envs.codesign.tools.misfit import LearnedMisfit
-from softgym_envs.codesign.tools.nuisance import ContactConfig, OffsetConfig
-from softgym_envs.codesign.tools.parameters import Parameters
 from softgym_envs.config import check_config
 from softgym_envs.errors import ConfigError, DataError
+from softgym_envs.extensions.design.box import Box
+from softgym_envs.extensions.design.calibration import calibrate, make_misfit
+from softgym_envs.extensions.design.cli import calibrate as calibrate_command
+from softgym_envs.extensions.design.config import CalibrationConfig
+from softgym_envs.extensions.design.contact import Plane
+from softgym_envs.extensions.design.measurements import measure, write_measurements
+from softgym_envs.extensions.design.misfit import LearnedMisfit
+from softgym_envs.extensions.design.nuisance import ContactConfig, OffsetConfig
+from softgym_envs.extensions.design.parameters import Parameters
 from softgym_envs.runs import RunFolder
 
 MODULUS, ZERO = 2.2e6, 0.8

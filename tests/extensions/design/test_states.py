@@ -9,9 +9,9 @@ import torch
 from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.codesign.metrics.metric import METRICS
-from softgym_envs.codesign.tools.bodies import Evaluator, LearnedBodies, full_command
-from softgym_envs.codesign.tools.box import Box
 from softgym_envs.errors import ConfigError, DesignError, InfeasibleDesign
+from softgym_envs.extensions.design.bodies import Evaluator, LearnedBodies, full_command
+from softgym_envs.extensions.design.box import Box
 from softgym_envs.extensions.sensing import metrics as sensors
 from softgym_envs.mechanics.solvers.statics import Statics
 

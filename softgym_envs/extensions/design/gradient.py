@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from softgym_envs.codesign.tools.box import Box
-from softgym_envs.codesign.tools.config import GradientConfig, ObjectiveConfig, OptimiseConfig
-from softgym_envs.codesign.tools.plots import draw_descents
-from softgym_envs.codesign.tools.records import BestDesign, Descent, GradientResult
+from softgym_envs.extensions.design.box import Box
+from softgym_envs.extensions.design.config import GradientConfig, ObjectiveConfig, OptimiseConfig
+from softgym_envs.extensions.design.plots import draw_descents
+from softgym_envs.extensions.design.records import BestDesign, Descent, GradientResult
 from softgym_envs.runs import RunFolder, provenance
 from softgym_envs.storage import write_json
 

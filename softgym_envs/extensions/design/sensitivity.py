@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.codesign.metrics.metric import find_metric
-from softgym_envs.codesign.tools.bodies import Evaluator
-from softgym_envs.codesign.tools.box import Box
-from softgym_envs.codesign.tools.config import SensitivityConfig
-from softgym_envs.codesign.tools.evaluation import Evaluation, evaluate_each
-from softgym_envs.codesign.tools.plots import draw_sensitivity
-from softgym_envs.codesign.tools.records import SensitivityResult
 from softgym_envs.errors import ConfigError, ConvergenceError, DataError
+from softgym_envs.extensions.design.bodies import Evaluator
+from softgym_envs.extensions.design.box import Box
+from softgym_envs.extensions.design.config import SensitivityConfig
+from softgym_envs.extensions.design.evaluation import Evaluation, evaluate_each
+from softgym_envs.extensions.design.plots import draw_sensitivity
+from softgym_envs.extensions.design.records import SensitivityResult
 from softgym_envs.runs import RunFolder
 from softgym_envs.storage import JsonLines, write_json
 

@@ -12,14 +12,14 @@ from torch import Tensor
 
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.backends.surrogate import solve_displacements, solve_efforts
-from softgym_envs.codesign.tools.bodies import RobotMaker, learned_model
-from softgym_envs.codesign.tools.contact import Plane, step_towards_plane
-from softgym_envs.codesign.tools.instrument import Instrument
-from softgym_envs.codesign.tools.measurements import Measurements, columns_of
-from softgym_envs.codesign.tools.nuisance import ContactConfig, FrameConfig, FrictionConfig, OffsetConfig
-from softgym_envs.codesign.tools.parameters import Parameters
 from softgym_envs.codesign.variables import split_values
 from softgym_envs.errors import ConfigError, ConvergenceError, DataError
+from softgym_envs.extensions.design.bodies import RobotMaker, learned_model
+from softgym_envs.extensions.design.contact import Plane, step_towards_plane
+from softgym_envs.extensions.design.instrument import Instrument
+from softgym_envs.extensions.design.measurements import Measurements, columns_of
+from softgym_envs.extensions.design.nuisance import ContactConfig, FrameConfig, FrictionConfig, OffsetConfig
+from softgym_envs.extensions.design.parameters import Parameters
 from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.model import Context
 

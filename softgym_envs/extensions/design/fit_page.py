@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from softgym_envs.codesign.tools.measurements import Measurements
-from softgym_envs.codesign.tools.plots import BASELINE, OTHER, STYLE, WINNER
-from softgym_envs.codesign.tools.records import CalibrationResult
+from softgym_envs.extensions.design.measurements import Measurements
+from softgym_envs.extensions.design.plots import BASELINE, OTHER, STYLE, WINNER
+from softgym_envs.extensions.design.records import CalibrationResult
 from softgym_envs.storage import atomic_write
 from softgym_envs.units import display
 

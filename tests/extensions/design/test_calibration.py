@@ -8,14 +8,14 @@ import pytest
 import torch
 
 from softgym_envs import make_robot
-from softgym_envs.codesign.tools.box import Box
-from softgym_envs.codesign.tools.calibration import calibrate, fit_gradient, profile_interval
-from softgym_envs.codesign.tools.config import CalibrationConfig
-from softgym_envs.codesign.tools.measurements import Measurements, measure, read_measurements, write_measurements
-from softgym_envs.codesign.tools.misfit import LearnedMisfit, Misfit
-from softgym_envs.codesign.tools.parameters import Parameters
 from softgym_envs.config import check_config
 from softgym_envs.errors import ConfigError, DataError
+from softgym_envs.extensions.design.box import Box
+from softgym_envs.extensions.design.calibration import calibrate, fit_gradient, profile_interval
+from softgym_envs.extensions.design.config import CalibrationConfig
+from softgym_envs.extensions.design.measurements import Measurements, measure, read_measurements, write_measurements
+from softgym_envs.extensions.design.misfit import LearnedMisfit, Misfit
+from softgym_envs.extensions.design.parameters import Parameters
 
 
 @pytest.fixture(scope="module")

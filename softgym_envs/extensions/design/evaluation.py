@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from softgym_envs.codesign.records import Record
-from softgym_envs.codesign.tools.bodies import Evaluator
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 from softgym_envs.executors import parallel_map
+from softgym_envs.extensions.design.bodies import Evaluator
 
 
 @dataclass(frozen=True)

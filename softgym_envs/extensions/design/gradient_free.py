@@ -13,11 +13,11 @@ import numpy as np
 from softgym_envs.codesign.sampling import make_sampler
 from softgym_envs.codesign.scheduling.journal import open_journal
 from softgym_envs.codesign.scheduling.optuna_study import trial_id
-from softgym_envs.codesign.tools.config import OptimiseConfig, SearchConfig
-from softgym_envs.codesign.tools.evaluation import Evaluation, evaluate_each
-from softgym_envs.codesign.tools.plots import draw_front
-from softgym_envs.codesign.tools.records import FrontDesign, SearchResult
 from softgym_envs.errors import ConvergenceError
+from softgym_envs.extensions.design.config import OptimiseConfig, SearchConfig
+from softgym_envs.extensions.design.evaluation import Evaluation, evaluate_each
+from softgym_envs.extensions.design.plots import draw_front
+from softgym_envs.extensions.design.records import FrontDesign, SearchResult
 from softgym_envs.runs import RunFolder
 from softgym_envs.storage import atomic_write, write_json
 from softgym_envs.wording import counted

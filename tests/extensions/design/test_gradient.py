@@ -5,10 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from softgym_envs.codesign.tools.config import OptimiseConfig
-from softgym_envs.codesign.tools.gradient import WeightedCost, descend, optimise
 from softgym_envs.config import check_config
 from softgym_envs.errors import ConfigError
+from softgym_envs.extensions.design.config import OptimiseConfig
+from softgym_envs.extensions.design.gradient import WeightedCost, descend, optimise
 
 BODIES = {
     "robot": "finger",

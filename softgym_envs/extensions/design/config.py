@@ -9,11 +9,17 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from softgym_envs.codesign.metrics.metric import Metric, find_metric, metric_name
 from softgym_envs.codesign.sampling import SamplerConfig
-from softgym_envs.codesign.tools.bodies import Evaluator, LearnedBodies, check_derivatives, check_metrics, full_command
-from softgym_envs.codesign.tools.box import Box
-from softgym_envs.codesign.tools.nuisance import AnyNuisance, check_nuisances
 from softgym_envs.codesign.variables import OptionRange, change_options
 from softgym_envs.config import BesideConfig, Config
+from softgym_envs.extensions.design.bodies import (
+    Evaluator,
+    LearnedBodies,
+    check_derivatives,
+    check_metrics,
+    full_command,
+)
+from softgym_envs.extensions.design.box import Box
+from softgym_envs.extensions.design.nuisance import AnyNuisance, check_nuisances
 from softgym_envs.robots.base import Robot
 from softgym_envs.robots.registry import make_robot
 
