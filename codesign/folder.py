@@ -122,7 +122,7 @@ class StudyFolder(RunFolder[StudyConfig]):
             _accept(old, config, where, "name", fixed)
             return {"config": config.model_dump(mode="json"), "goals": shared["goals"]}
 
-        shared = storage.agree(accept, 1 + len(config.secondary_objectives))
+        shared = storage.agree(accept, config.directions)
         if mine is None:
             write_json(known, {"id": shared["id"]})
         return shared["goals"]

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from softgym_envs.agents.config import LearnerConfig
+from softgym_envs.agents.config import EnvironmentConfig, LearnerConfig, TrainConfig
 from softgym_envs.codesign.sampling import check_options
 from softgym_envs.config import Config
 
@@ -121,6 +123,29 @@ class TrainingConfig(LearnerConfig):
     steps: int = Field(default=2_500, ge=1, description="environment steps of one trial")
     report_every: int = Field(default=500, ge=1, description="environment steps between two reports to the pruner")
     evaluation_episodes: int = Field(default=32, ge=1, description="episodes of each report")
+
+    def on(
+        self,
+        environment: EnvironmentConfig,
+        goals: np.ndarray,
+        design: Mapping[str, float],
+        sample_design: bool | Sequence[str] = False,
+        **changes: Any,
+    ) -> TrainConfig:
+        """Return the configuration of this training in an environment.
+
+        Args:
+            environment: the environment.
+            goals: goals of the training [m], shape (k, 3); none for those that the task draws.
+            design: complete design [SI].
+            sample_design: names of the variables that vary in the training; default none.
+            **changes: keys of the training with other values.
+        """
+        update: dict[str, Any] = {"design": dict(design), "sample_design": sample_design}
+        if len(goals):
+            update["task_options"] = {**environment.task_options, "goals": goals.tolist()}
+        keys = self.model_dump(include=set(TrainConfig.model_fields))
+        return TrainConfig(environment=environment.model_copy(update=update), **{**keys, **changes})
 
 
 class JointConfig(TrainingConfig):

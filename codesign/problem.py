@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 from pydantic import Field, field_validator, model_validator
 
 from softgym_envs.agents.config import EnvironmentConfig
-from softgym_envs.codesign.metrics.metric import Metric, find_metric, metric_name
+from softgym_envs.codesign.metrics.metric import Direction, Metric, find_metric, metric_name
 from softgym_envs.codesign.metrics.sources import BODY, DESIGN, EPISODES
 from softgym_envs.codesign.variables import OptionRange, make_variables, split_values, with_options
 from softgym_envs.config import Config
@@ -108,15 +108,18 @@ class StudyProblem(Config):
         return self.objectives[self.objective]
 
     @property
-    def directions(self) -> list[Literal["maximize"]]:
-        """Direction of each score in Optuna's studies: all are maximised."""
-        return ["maximize" for _ in (self.objective, *self.secondary_objectives)]
+    def score_names(self) -> tuple[str, ...]:
+        """Names of the objectives that have a score, the one that decides first."""
+        return self.objective, *self.secondary_objectives
+
+    def signed(self, scores: Sequence[float]) -> list[float]:
+        """Return the values [SI] behind scores, or scores of values: the sign of what is minimised differs."""
+        return [self.objectives[name].score(score) for name, score in zip(self.score_names, scores, strict=True)]
 
     @property
-    def score_names(self) -> list[str]:
-        """Names of the scores in Optuna's studies; what is minimised has a score with the opposite sign."""
-        names = (self.objective, *self.secondary_objectives)
-        return [name if self.objectives[name].maximize else f"-{name}" for name in names]
+    def directions(self) -> list[Direction]:
+        """Direction of each of these."""
+        return [self.objectives[name].direction for name in self.score_names]
 
     @property
     def controller_constraints(self) -> dict[str, float]:

@@ -82,9 +82,26 @@ class StudyRecord(Record):
         write_signed(path, self.to_json())
 
 
+@dataclass(eq=False, kw_only=True)
+class Score(Record):
+    """Metrics of one body and their cost, or the reason why it has none."""
+
+    design: dict[str, float] = field(default_factory=dict)  # values of its variables [SI]
+    values: dict[str, float] = field(default_factory=dict)  # of each metric [SI]
+    scores: list[float] = field(default_factory=list)  # of the objectives, larger is better; empty if there are none
+    reason: str | None = None  # why the body is infeasible
+    seconds: float = 0.0  # wall-clock time [s]
+    cpu_seconds: float = 0.0
+
+    @property
+    def feasible(self) -> bool:
+        """Whether the body exists and could be simulated."""
+        return self.reason is None
+
+
 @dataclass(eq=False)
-class TrialResult(StudyRecord):
-    """Result of one trial."""
+class TrialResult(StudyRecord, Score):
+    """Result of one trial; its design is complete, and only complete trials have scores."""
 
     EVALUATIONS = ("evaluation", "qp", "judge")
     REMEDY = RESTORE
@@ -92,13 +109,9 @@ class TrialResult(StudyRecord):
     number: int
     origin: str  # of its body: "baseline", "screen 3", "joint 0" or "sampler 7"
     process: str  # "host:pid" of the worker
-    design: dict[str, float]  # complete [SI]
     options: dict[str, float] = field(default_factory=dict)  # variables that are options, by their full names [SI]
     sampler_seed: int | None = None  # of the sampler that proposed the body, if one did
-    state: Literal["complete", "pruned", "infeasible"] = "complete"
-    reason: str | None = None  # why the trial is not complete
-    values: dict[str, float] = field(default_factory=dict)  # of each objective that the study names [SI]
-    scores: list[float] | None = None  # of objective and secondary objectives, larger is better; complete trials only
+    state: Literal["complete", "pruned", "infeasible"] = "complete"  # `reason` says why it is not complete
     violations: dict[str, float] = field(default_factory=dict)  # of each constraint [SI]; positive if it is violated
     controller: str = "qp"  # or the file of the policy, relative to the folder of the study
     evaluation: Evaluation | None = None  # of the controller on the selection goals
@@ -108,14 +121,12 @@ class TrialResult(StudyRecord):
     judge_value: float | None = None  # of the objective with that policy [SI]
     curve: list[list[float]] = field(default_factory=list)  # environment steps and score of each report in training
     training_steps: int = 0
-    seconds: float = 0.0  # wall-clock time [s]
-    cpu_seconds: float = 0.0  # CPU time, that of earlier workers of the trial included [s]
     finished_at: float = 0.0  # time of the end [s since 1970]
 
     @property
     def score(self) -> float | None:
         """Score of the objective; larger is better."""
-        return None if self.scores is None else self.scores[0]
+        return self.scores[0] if self.scores else None
 
     @property
     def feasible(self) -> bool:
@@ -130,16 +141,13 @@ class TrialResult(StudyRecord):
 
 
 @dataclass(eq=False)
-class ScreenResult(StudyRecord):
-    """Score of one candidate of the screen."""
+class ScreenResult(StudyRecord, Score):
+    """Score of one candidate of the screen; its design has the optimised variables."""
 
     EVALUATIONS = ("evaluation",)
 
     index: int
-    values: dict[str, float]  # of each optimised variable [SI]
     evaluation: Evaluation | None = None  # of the inverse QP; None for an infeasible body
-    score: float | None = None  # larger is better
-    error: str | None = None  # why the body is infeasible
 
 
 @dataclass(eq=False)

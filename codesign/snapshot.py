@@ -103,13 +103,13 @@ class StudySnapshot:
 
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         study = optuna.create_study(directions=self.config.directions)
-        space = distributions(self.config)
+        space = distributions(self.config.optimised)
         for trial in self.trials:
             if trial.state == "complete":
                 stored = optuna.create_trial(
                     params={name: {**trial.design, **trial.options}[name] for name in space},
                     distributions=space,
-                    values=trial.scores,
+                    values=self.config.signed(trial.scores),
                     user_attrs={"number": trial.number},
                     constraints=trial.violations,
                 )

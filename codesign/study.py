@@ -149,7 +149,7 @@ def _try_sampler(config: StudyConfig) -> None:
     import optuna
 
     sampler, pruner = config.sampler, config.pruner
-    space, rng = distributions(config), np.random.default_rng(0)
+    space, rng = distributions(config.optimised), np.random.default_rng(0)
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     try:
         study = optuna.create_study(directions=config.directions, sampler=make_sampler(sampler, 0))

@@ -36,7 +36,7 @@ from softgym_envs.backends import make_backend
 from softgym_envs.cli.app import cli
 from softgym_envs.codesign.report.page import SECTIONS
 from softgym_envs.codesign.sampling import SamplerConfig, make_sampler
-from softgym_envs.extensions.design.bodies import Evaluator
+from softgym_envs.extensions.design.bodies import StateEvaluator
 from softgym_envs.surrogate import pretrained_model
 
 robot = softgym_envs.make_robot("peg")
@@ -63,7 +63,7 @@ policy = train(config, "training", progress=False)
 goals = sample_goals(config.environment, 2, seed=1)
 for agent in (policy, "idle"):
     assert len(evaluate(agent, config.environment, goals).returns) == 2
-found = Evaluator(robot, ["slenderness"], backend="fem")({"length": 0.06, "width": 0.012})
+found = StateEvaluator(robot, ["slenderness"], backend="fem").measure({"length": 0.06, "width": 0.012})
 assert abs(found["slenderness"] - 5.0) < 1e-12
 assert type(make_sampler(SamplerConfig(name="brute"), 0)).__name__ == "BruteForceSampler"
 assert SECTIONS["peg"].title == "Pegs"

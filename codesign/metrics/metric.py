@@ -157,6 +157,11 @@ class Metric:
         return decimal(value * self.scale, 1 if self.display.unit == "%" else 2, sign)
 
     @property
+    def stored_name(self) -> str:
+        """Name and SI unit, for columns of values [SI]: ``"mean_distance [m]"``."""
+        return self.name if self.unit == "1" else f"{self.name} [{self.unit}]"
+
+    @property
     def axis(self) -> str:
         """Label and unit, for figures: ``"Mean actuator effort [N]"``."""
         return f"{self.label}{f' [{self.display.unit}]' if self.display.unit else ''}"
@@ -233,12 +238,15 @@ def find_metric(name: str | Metric, robot: Robot | None = None, task: type[Task]
     else:
         raise ValueError(unknown_name("metric", name, METRICS, other="one of your own as 'module:attribute'"))
     if found.unit == "effort" and robot is not None:
-        shown = {display(effort_unit(actuator.unit)) for actuator in robot.actuators}
-        found = replace(found, shown=shown.pop() if len(shown) == 1 else Display("SI units", 1.0, 2))
+        units = {effort_unit(actuator.unit) for actuator in robot.actuators}
+        found = (
+            replace(found, unit=units.pop()) if len(units) == 1 else replace(found, shown=Display("SI units", 1.0, 2))
+        )
     if found.unit == "distance" and task is not None:
         scale = task.distance_scale
         label = found.label.replace("distance", scale.name)
-        found = replace(found, label=label, shown=Display(scale.unit, scale.factor, 1 if scale.unit == "%" else 2))
+        shown = Display(scale.unit, scale.factor, 1 if scale.unit == "%" else 2)
+        found = replace(found, label=label, shown=shown, unit="1" if scale.unit == "%" else "m")
     return found
 
 

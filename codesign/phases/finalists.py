@@ -21,7 +21,7 @@ from softgym_envs.agents.training import train
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.folder import SHARED_POLICY, StudyFolder
 from softgym_envs.codesign.phases.ends import check_policy, run_ends
-from softgym_envs.codesign.phases.trial import assess, measure, training_config
+from softgym_envs.codesign.phases.trial import assess, body_training, measure
 from softgym_envs.codesign.records import REFINED, Finalist, FinalistTest, FinalistTraining, Job, PlannedTest
 from softgym_envs.codesign.snapshot import StudySnapshot
 from softgym_envs.errors import ConfigError, ConvergenceError, InfeasibleDesign
@@ -178,7 +178,7 @@ def _join(folder: StudyFolder, plan: PlannedTest, files: Sequence[Path]) -> Fina
 def _trained_policy(folder: StudyFolder, finalist: Finalist, seed: int) -> Path:
     """Return the policy of a finalist, trained anew with a seed from where the policies of the trials start."""
     config = folder.config
-    training = training_config(folder, finalist.design, finalist.options)
+    training = body_training(folder, finalist.design, finalist.options)
     steps = config.finalists.steps or training.steps
     initial = config.policy if config.plan.trains else str(folder.path / SHARED_POLICY)
     update: dict[str, Any] = {"seed": training.seed + seed, "steps": steps}

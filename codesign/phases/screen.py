@@ -7,9 +7,9 @@ from functools import partial
 import numpy as np
 
 from softgym_envs.codesign.folder import StudyFolder
-from softgym_envs.codesign.phases.trial import assess
+from softgym_envs.codesign.phases.trial import assess, rate
 from softgym_envs.codesign.records import Job, ScreenResult
-from softgym_envs.errors import ConvergenceError, InfeasibleDesign
+from softgym_envs.codesign.scoring import scoring
 
 
 def candidates(folder: StudyFolder) -> list[dict[str, float]]:
@@ -38,12 +38,12 @@ def screen_jobs(folder: StudyFolder) -> list[Job]:
     def make(index: int, values: dict[str, float]) -> ScreenResult:
         design, options = config.body(values)
         goals = folder.goals["selection"][: config.screen.goals]
-        try:
+        result = ScreenResult(index, design=values)
+        with scoring(result):
             found = assess("qp", config, config.environment_of(options), goals, design)
-        except (InfeasibleDesign, ConvergenceError) as error:
-            return ScreenResult(index, values, error=str(error))
-        score = config.primary.score(found.values[config.objective])
-        return ScreenResult(index, values, found.evaluation, score)
+            result.evaluation = found.evaluation
+            rate(result, config, found)
+        return result
 
     return [
         Job(folder.path / "screen" / f"{index:03d}.json", partial(make, index, values))
@@ -55,9 +55,9 @@ def kept_bodies(folder: StudyFolder) -> list[tuple[str, dict[str, float]]]:
     """Return origin and values of the candidates that become trials, best first."""
 
     def key(result: ScreenResult) -> tuple[float, float]:
-        assert result.score is not None and result.evaluation is not None
-        return result.score, -result.evaluation.mean_distance
+        assert result.evaluation is not None
+        return result.scores[0], -result.evaluation.mean_distance
 
     results = (ScreenResult.read(path) for path in sorted(folder.path.glob("screen/[0-9]*.json")))
-    feasible = sorted((result for result in results if result.score is not None), key=key, reverse=True)
-    return [(f"screen {result.index}", result.values) for result in feasible[: folder.config.screen.kept]]
+    feasible = sorted((result for result in results if result.feasible), key=key, reverse=True)
+    return [(f"screen {result.index}", result.design) for result in feasible[: folder.config.screen.kept]]

@@ -48,11 +48,7 @@ def promising_bodies(folder: StudyFolder) -> list[tuple[str, dict[str, float]]]:
 def joint_config(folder: StudyFolder) -> TrainConfig:
     """Return the configuration of the joint training, on the training goals of the study."""
     config = folder.config
-    update: dict[str, Any] = {"design": dict(config.baseline), "sample_design": list(config.variables)}
-    if len(goals := folder.goals["training"]):
-        update["task_options"] = {**config.environment.task_options, "goals": goals.tolist()}
-    joint = config.joint.model_dump(exclude={"keep", "options"})
-    return TrainConfig(environment=config.environment.model_copy(update=update), **joint)
+    return config.joint.on(config.environment, folder.goals["training"], config.baseline, list(config.variables))
 
 
 def _report_steps(config: StudyConfig) -> int:

@@ -17,8 +17,8 @@ from softgym_envs.codesign.metrics.metric import Metric
 from softgym_envs.codesign.metrics.sources import Outcome
 from softgym_envs.codesign.phases.shared_policy import shared_policy
 from softgym_envs.codesign.problem import StudyProblem
-from softgym_envs.codesign.records import Assessment, TrialResult
-from softgym_envs.errors import ConvergenceError, InfeasibleDesign
+from softgym_envs.codesign.records import Assessment, Score, TrialResult
+from softgym_envs.codesign.scoring import scoring
 from softgym_envs.storage import read_json
 from softgym_envs.wording import counted
 
@@ -56,17 +56,16 @@ def measure(
     return Assessment(evaluation, {name: each.measure(outcome) for name, each in config.objectives.items()})
 
 
-def training_config(folder: StudyFolder, design: Mapping[str, float], options: Mapping[str, float]) -> TrainConfig:
+def rate(score: Score, problem: StudyProblem, found: Assessment) -> None:
+    """Write the objectives of an assessment into a score."""
+    score.values = {name: float(value) for name, value in found.values.items()}
+    score.scores = [problem.objectives[name].score(score.values[name]) for name in problem.score_names]
+
+
+def body_training(folder: StudyFolder, design: Mapping[str, float], options: Mapping[str, float]) -> TrainConfig:
     """Return the configuration for training on one body and the training goals of the study."""
-    config, goals = folder.config, folder.goals["training"]
-    environment, training = config.environment_of(options), config.training
-    task_options = {**environment.task_options, **({"goals": goals.tolist()} if len(goals) else {})}
-    return TrainConfig(
-        environment=environment.model_copy(
-            update={"design": dict(design), "sample_design": False, "task_options": task_options}
-        ),
-        **training.model_dump(),
-    )
+    config = folder.config
+    return config.training.on(config.environment_of(options), folder.goals["training"], design)
 
 
 def run_trial(folder: StudyFolder, trial: optuna.Trial) -> TrialResult:
@@ -74,17 +73,12 @@ def run_trial(folder: StudyFolder, trial: optuna.Trial) -> TrialResult:
 
     Only `InfeasibleDesign` and `ConvergenceError` make a body infeasible; other exceptions are bugs.
     """
-    started, cpu = time.perf_counter(), time.process_time()
     result = _new_result(folder, trial)
-    try:
+    with scoring(result):
         _Runner(folder, trial, result).run()
-    except (InfeasibleDesign, ConvergenceError) as error:
-        result.state, result.reason = "infeasible", str(error)
-    if result.scores is not None and not np.isfinite(result.scores).all():
-        result.state, result.reason = "infeasible", f"the scores are not finite: {result.scores}"
-        result.scores = None
-    result.cpu_seconds += time.process_time() - cpu
-    result.seconds, result.finished_at = time.perf_counter() - started, time.time()
+    if result.reason is not None and result.state == "complete":
+        result.state = "infeasible"
+    result.finished_at = time.time()
     result.write(folder.trial(trial.number) / "result.json")
     return result
 
@@ -155,14 +149,13 @@ class _Runner:
     def _score(self, assessment: Assessment) -> None:
         """Record an evaluation, and for a complete trial its scores and violations."""
         config, result = self.config, self.result
-        result.evaluation, result.values = assessment.evaluation, assessment.values
+        rate(result, config, assessment)
+        result.evaluation = assessment.evaluation
         if result.state != "complete":
+            result.scores = []
             return
-        objectives = config.objectives
-        names = (config.objective, *config.secondary_objectives)
-        result.scores = [objectives[name].score(result.values[name]) for name in names]
         for name, limit in config.constraints.items():
-            result.violations[name] = objectives[name].excess(result.values[name], limit)
+            result.violations[name] = config.objectives[name].excess(result.values[name], limit)
             self.trial.set_constraint(name, result.violations[name])
 
     def _assess_by_goals(self, agent: str | Path) -> Assessment:
@@ -184,7 +177,7 @@ class _Runner:
                 )
             for k, value in enumerate(values):
                 if start + k not in known:
-                    trial.report(objective.score(value), start + k)
+                    trial.report(value, start + k)
             if self.prunable and start + batch < count and trial.should_prune():
                 seen = start + len(values)
                 self.result.state = "pruned"
@@ -198,7 +191,7 @@ class _Runner:
         reporter = _Reporter(self.trial, config.primary, result, self.environment, prunable=self.prunable)
         cpu = time.process_time()
         policy = train(
-            training_config(self.folder, result.design, result.options),
+            body_training(self.folder, result.design, result.options),
             self.folder.trial(result.number),
             initial=config.policy,
             report=reporter,
@@ -232,15 +225,16 @@ class _Reporter:
         self.objective = objective
         self.design = result.design
         self.robot = environment.make_robot()
-        self.curve: dict[int, float] = dict(trial.study.get_trials(deepcopy=False)[trial.number].intermediate_values)
+        reported = trial.study.get_trials(deepcopy=False)[trial.number].intermediate_values
+        self.curve = {step: objective.score(value) for step, value in reported.items()}
         self.pruned = False
         self.prunable = prunable
 
     def __call__(self, step: int, evaluation: Evaluation) -> bool:
         """Report an evaluation; return whether the training should stop."""
-        value = self.objective.score(self.objective.measure(Outcome(evaluation, self.design, self.robot)).value)
+        value = self.objective.measure(Outcome(evaluation, self.design, self.robot)).value
         if step not in self.curve and np.isfinite(value):
-            self.curve[step] = value
+            self.curve[step] = self.objective.score(value)
             self.trial.report(value, step)
         self.pruned = self.prunable and self.trial.should_prune()
         return self.pruned

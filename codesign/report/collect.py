@@ -242,7 +242,8 @@ def _importance(snapshot: StudySnapshot) -> dict[str, float]:
     if len(scores) < 8 or len(snapshot.config.variables) < 2 or len(set(scores)) < 3:
         return {}
     evaluator = optuna.importance.PedAnovaImportanceEvaluator(target_quantile=0.25)
-    first = (lambda trial: -trial.values[0]) if snapshot.config.secondary_objectives else None
+    sign = snapshot.objective.sign
+    first = (lambda trial: -sign * trial.values[0]) if snapshot.config.secondary_objectives else None
     try:
         with warnings.catch_warnings():  # it warns that it takes small values for good ones, which is what we want
             warnings.filterwarnings("ignore", "PedAnovaImportanceEvaluator computes", UserWarning)

@@ -253,7 +253,7 @@ def _learning(snapshot: StudySnapshot, results: StudyResults) -> Iterator[Titled
 def screen(snapshot: StudySnapshot, results: StudyResults) -> Figure | None:
     """Objective of each body with the inverse QP and with its trained controller; None without one."""
     objective = snapshot.objective
-    done = [t for t in snapshot.trials if t.scores is not None and t.controller != "qp" and t.qp_value is not None]
+    done = [t for t in snapshot.trials if t.scores and t.controller != "qp" and t.qp_value is not None]
     if len(done) < 2:
         return None
     titles = [f"{controller}: {objective.axis_inside}" for controller in ("inverse QP", "policy")]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.folder import EXTENSIBLE, StudyFolder
 from softgym_envs.codesign.records import TrialResult
-from softgym_envs.codesign.scheduling.journal import JournalStorage, open_journal
+from softgym_envs.codesign.scheduling.journal import open_journal
 from softgym_envs.config import check_config, difference
 from softgym_envs.errors import ConfigError, DataError, SoftGymError
 from softgym_envs.storage import RESTORE
@@ -31,12 +31,12 @@ def check_journal(folder: StudyFolder, results: Sequence[TrialResult]) -> None:
     """
     path = folder.path / "journal.log"
     storage = open_journal(path, mend=False)
-    try:
-        study = storage.get_study_id_from_name(JournalStorage.study)
-    except KeyError:
+    begun = storage.get_all_studies()
+    if not begun:
         if results:
-            raise DataError(f"'{path}' holds no study, but there are results of trials; {RESTORE}") from None
+            raise DataError(f"'{path}' holds no study, but there are results of trials; {RESTORE}")
         return
+    study = storage.get_study_id_from_name(begun[0].study_name)
     _check_inputs(folder, storage.get_study_user_attrs(study), path)
     trials = storage.get_all_trials(study, deepcopy=False)
     known = {result.number for result in results}
@@ -83,7 +83,7 @@ def _difference(config: StudyConfig, trial: FrozenTrial, result: TrialResult) ->
         rows += [
             ("state", trial.state.name, state),
             # Optuna gives pruned trials their last report as a value.
-            ("scores", trial.values if trial.state.name == "COMPLETE" else None, result.scores),
+            ("scores", config.signed(trial.values) if trial.state.name == "COMPLETE" else [], result.scores),
             ("values", known.get("values"), result.values),
             ("controller", known.get("controller"), result.controller),
         ]

@@ -16,7 +16,7 @@ def open_storage(folder: Path, config: StudyConfig, *, wait: bool = True) -> Stu
     if config.storage == JOURNAL:
         from softgym_envs.codesign.scheduling.journal import JournalStorage
 
-        return JournalStorage(folder)
+        return JournalStorage(folder, config.name)
     from softgym_envs.codesign.scheduling.postgres import PostgresStorage
 
     return PostgresStorage(config.storage, config.name, grace=config.heartbeat, patience=config.patience, wait=wait)

@@ -61,12 +61,13 @@ def _is_record(line: bytes) -> bool:
 class JournalStorage(StudyStorage):
     """Optuna's journal in the folder of a study."""
 
-    study = "codesign"
     shared = False
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, name: str) -> None:
         self.folder = folder
         self._optuna = self._open()
+        begun = self._optuna.get_all_studies()
+        self.study = begun[0].study_name if begun else name  # a study may be renamed later
 
     def _open(self) -> optuna.storages.BaseStorage:
         # Unlike Optuna's own lock files, these are freed by the kernel when their holder is killed.

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.folder import StudyFolder
 from softgym_envs.codesign.parts import PRUNERS
-from softgym_envs.codesign.problem import StudyProblem
 from softgym_envs.codesign.sampling import construct, make_sampler
 from softgym_envs.codesign.scheduling.storage import StudyStorage
+from softgym_envs.designs import DesignVariable
 from softgym_envs.errors import DataError
 
 if TYPE_CHECKING:
@@ -29,21 +30,31 @@ def make_pruner(config: StudyConfig) -> optuna.pruners.BasePruner:
     return construct(getattr(optuna.pruners, PRUNERS[config.pruner.name]), options)
 
 
-def distributions(config: StudyProblem) -> dict[str, optuna.distributions.BaseDistribution]:
-    """Return the range of each optimised variable [SI]; of a choice, the middle of each of its values."""
+def distributions(variables: Mapping[str, DesignVariable]) -> dict[str, optuna.distributions.BaseDistribution]:
+    """Return the range of each variable [SI]; of a choice, the middle of each of its values."""
     import optuna
 
     return {
         name: optuna.distributions.CategoricalDistribution([k + 0.5 for k in range(len(variable.choices))])
         if variable.choices
         else optuna.distributions.FloatDistribution(variable.low, variable.high, log=variable.log)
-        for name, variable in config.optimised.items()
+        for name, variable in variables.items()
     }
 
 
 def trial_id(storage: optuna.storages.BaseStorage, study: optuna.Study, number: int) -> int:
     """Return the ID by which a storage knows a trial of a study."""
     return storage.get_trial_id_from_study_id_trial_number(storage.get_study_id_from_name(study.study_name), number)
+
+
+def tell(study: optuna.Study, number: int, values: Sequence[float] = ()) -> None:
+    """Finish a trial with its values, or as pruned: samplers rank it last, but would ignore a failed one."""
+    import optuna
+
+    if values:
+        study.tell(number, list(values))
+    else:
+        study.tell(number, state=optuna.trial.TrialState.PRUNED)
 
 
 def open_study(folder: StudyFolder, storage: StudyStorage | None = None, number: int = 0) -> optuna.Study:
@@ -78,11 +89,16 @@ def open_study(folder: StudyFolder, storage: StudyStorage | None = None, number:
 
 
 def _describe(study: optuna.Study, config: StudyConfig) -> None:
-    """Tell Optuna's own tools what a study is about, and what its scores are called."""
-    import optuna
-
+    """Tell Optuna's own tools what a study is about."""
     study.set_user_attr("environment", config.environment.id)
     study.set_user_attr("strategy", config.strategy)
+    name_metrics(study, [config.objectives[name].stored_name for name in config.score_names])
+
+
+def name_metrics(study: optuna.Study, names: Sequence[str]) -> None:
+    """Tell Optuna's own tools what the values of a study are called."""
+    import optuna
+
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-        study.set_metric_names(config.score_names)
+        study.set_metric_names(list(names))

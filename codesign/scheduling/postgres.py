@@ -15,11 +15,12 @@ import sys
 import threading
 import time
 import uuid
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from softgym_envs.codesign.metrics.metric import Direction
 from softgym_envs.codesign.scheduling.storage import SharedStorage
 from softgym_envs.errors import ConfigError, SoftGymError
 
@@ -226,7 +227,9 @@ class PostgresStorage(SharedStorage):
 
     # -- the study --------------------------------------------------------------------------------------------------
 
-    def agree(self, accept: Callable[[dict[str, Any] | None], dict[str, Any]], objectives: int = 1) -> dict[str, Any]:
+    def agree(
+        self, accept: Callable[[dict[str, Any] | None], dict[str, Any]], directions: Sequence[Direction] = ("minimize",)
+    ) -> dict[str, Any]:
         def action() -> dict[str, Any]:
             import optuna
 
@@ -237,7 +240,6 @@ class PostgresStorage(SharedStorage):
                 study, old = None, None
             new = accept(old)
             if study is None:
-                directions = [optuna.study.StudyDirection.MAXIMIZE] * objectives
                 study = optuna.create_study(study_name=self.study, storage=self.optuna, directions=directions)
             new["id"] = uuid.uuid4().hex if old is None else old["id"]
             for key, value in new.items():

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from softgym_envs.codesign.folder import StudyFolder
 from softgym_envs.codesign.records import TrialResult
 from softgym_envs.codesign.sampling import trial_seed
-from softgym_envs.codesign.scheduling.optuna_study import distributions, open_study, trial_id
+from softgym_envs.codesign.scheduling.optuna_study import distributions, open_study, tell, trial_id
 
 if TYPE_CHECKING:
     import optuna
@@ -99,6 +99,15 @@ class TrialQueue:
                     study.enqueue_trial(values, user_attrs={"origin": origin})
 
         self._exclusively(action)
+
+    def ask(self) -> list[optuna.Trial]:
+        """Take the next trial, in a list; none if the study has all its trials."""
+        trial = self.claim()
+        return [] if trial is None else [trial]
+
+    def tell(self, trial: optuna.Trial, result: TrialResult) -> None:
+        """Record the result of a trial; see `finish`."""
+        self.finish(result)
 
     def claim(self) -> optuna.Trial | None:
         """Take the next trial; None if the study has all its trials."""
@@ -183,7 +192,7 @@ class TrialQueue:
         if not self._claimable(study):
             return None
         number = len(study.get_trials(deepcopy=False))
-        trial = open_study(self.folder, self.storage, number).ask(distributions(config))
+        trial = open_study(self.folder, self.storage, number).ask(distributions(config.optimised))
         if self.call is not None:
             trial.set_user_attr("call", self.call)
         trial.set_user_attr("process", f"{socket.gethostname()}:{os.getpid()}")
@@ -205,8 +214,6 @@ class TrialQueue:
         return counted < self.folder.config.trials or any(trial.state == TrialState.WAITING for trial in trials)
 
     def _tell(self, study: optuna.Study, trial: optuna.trial.FrozenTrial, result: TrialResult) -> None:
-        from optuna.trial import TrialState
-
         attributes: dict[str, Any] = {}
         if result.evaluation is not None:
             attributes = {name: getattr(result.evaluation, name) for name in REPORTED_METRICS}
@@ -218,11 +225,8 @@ class TrialQueue:
         known = trial_id(self.storage.optuna, study, trial.number)
         for key, value in attributes.items():
             self.storage.optuna.set_trial_user_attr(known, key, value)
-        if result.state == "complete":
-            study.tell(trial.number, result.scores)
-        else:
-            # Infeasible bodies are pruned without a value: samplers rank them last, but would ignore failed trials.
-            study.tell(trial.number, state=TrialState.PRUNED)
+        complete = result.state == "complete"
+        tell(study, trial.number, self.folder.config.signed(result.scores) if complete else ())
 
     def _recover(self, study: optuna.Study) -> None:
         from optuna.trial import TrialState

@@ -7,9 +7,11 @@ one machine. `softgym_envs.codesign.scheduling.postgres.PostgresStorage` keeps t
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any, TypeVar
+
+from softgym_envs.codesign.metrics.metric import Direction
 
 if TYPE_CHECKING:
     import optuna
@@ -74,11 +76,13 @@ class SharedStorage(StudyStorage):
     shared = True
 
     @abstractmethod
-    def agree(self, accept: Callable[[dict[str, Any] | None], dict[str, Any]], objectives: int = 1) -> dict[str, Any]:
+    def agree(
+        self, accept: Callable[[dict[str, Any] | None], dict[str, Any]], directions: Sequence[Direction] = ("minimize",)
+    ) -> dict[str, Any]:
         """Find or make the study, and return what all its machines share, with the ``id`` of the study.
 
         ``accept`` takes what is shared so far (None for a new study) and returns what to share from now on, as plain
-        data. If it raises, nothing changes. Each trial has a score for each of the ``objectives``, all to be maximised.
+        data. If it raises, nothing changes. Each trial has a value for each of the ``directions``.
         """
 
     @abstractmethod

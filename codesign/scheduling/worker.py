@@ -7,31 +7,37 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from softgym_envs.codesign.folder import StudyFolder
 from softgym_envs.codesign.phases.finalists import fetch_policies, finalist_jobs
 from softgym_envs.codesign.phases.screen import screen_jobs
 from softgym_envs.codesign.phases.shared_policy import shared_policy_jobs
 from softgym_envs.codesign.phases.trial import give_up, run_trial
+from softgym_envs.codesign.records import TrialResult
 from softgym_envs.codesign.scheduling.jobs import run_pending
 from softgym_envs.codesign.scheduling.queue import TrialQueue
+from softgym_envs.codesign.search import run_search
 from softgym_envs.codesign.snapshot import load_study
 from softgym_envs.errors import SoftGymError
+
+if TYPE_CHECKING:
+    import optuna
 
 
 def run_trials(folder: StudyFolder) -> None:
     """Run trials until the study has as many as its configuration says."""
     from optuna.exceptions import UpdateFinishedTrialError
 
-    with TrialQueue(folder) as queue:
-        while (trial := queue.claim()) is not None:
+    def evaluate(trials: Sequence[optuna.Trial]) -> Iterator[tuple[optuna.Trial, TrialResult]]:
+        for trial in trials:
             run = give_up if trial.user_attrs.get("attempt", 1) > folder.config.attempts else run_trial
             try:
                 # If the connection to the storage breaks, training continues from its last checkpoint.
-                result = queue.storage.patiently(partial(run, folder, trial))
+                yield trial, queue.storage.patiently(partial(run, folder, trial))
             except UpdateFinishedTrialError:  # reassigned after missed heartbeats
                 continue
             except SoftGymError:  # a problem of the installation or the storage
@@ -39,7 +45,9 @@ def run_trials(folder: StudyFolder) -> None:
             except Exception:
                 trial.set_user_attr("raised", True)
                 raise
-            queue.finish(result)
+
+    with TrialQueue(folder) as queue:
+        run_search(queue, evaluate)
 
 
 def _test_finalists(folder: StudyFolder) -> None:

@@ -6,6 +6,8 @@ from contextlib import nullcontext
 
 import optuna
 import pytest
+from optuna.storages import JournalStorage
+from optuna.storages.journal import JournalFileBackend
 from optuna.trial import TrialState
 
 from softgym_envs.codesign.records import TrialResult
@@ -22,7 +24,7 @@ def die(queue):
 
 
 def result(trial, score=0.5, **changes):
-    fields = {"origin": "", "process": "", "design": {}, "scores": None if score is None else [score], **changes}
+    fields = {"origin": "", "process": "", "design": {}, "scores": [] if score is None else [score], **changes}
     return TrialResult(trial.number, **fields)
 
 
@@ -43,12 +45,16 @@ def test_budget_is_shared(study):
 
 
 def test_optunas_own_tools_find_names_and_results(study):
-    folder = study(trials=1, secondary_objectives=["mean_effort"])
+    folder = study(trials=2, secondary_objectives=["success_rate", "mean_effort"])
     with TrialQueue(folder) as queue:
-        found = result(queue.claim(), None, scores=[0.5, -3.0], values={"success": 0.5}, design={"height": 0.02})
-        queue.finish(found)
-        optunas = queue.study
-    assert optunas.metric_names == folder.config.score_names == ["-mean_distance", "-mean_effort"]
+        for scores in ([-0.004, 0.5, -3.0], [-0.002, 0.25, -2.0]):
+            queue.finish(result(queue.claim(), None, scores=scores, values={"success": 0.5}, design={"height": 0.02}))
+    journal = JournalStorage(JournalFileBackend(str(folder.path / "journal.log")))
+    optunas = optuna.load_study(study_name="tiny", storage=journal)
+    assert optunas.metric_names == ["mean_distance [m]", "success_rate", "mean_effort [N]"]
+    assert [direction.name for direction in optunas.directions] == ["MINIMIZE", "MAXIMIZE", "MINIMIZE"]
+    assert [trial.values for trial in optunas.trials] == [[0.004, 0.5, 3.0], [0.002, 0.25, 2.0]]
+    assert [trial.number for trial in optunas.best_trials] == [0, 1]
     described = {"environment": folder.config.environment.id, "strategy": folder.config.strategy}
     begun = {"config": folder.config.model_dump(mode="json"), "goals": folder.stored_goals}
     assert optunas.user_attrs == {**described, **begun}

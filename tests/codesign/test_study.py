@@ -88,7 +88,8 @@ def test_nothing_is_lost_or_duplicated(finished):
     assert sum(origin.startswith("screen") for origin in origins) == 2
     assert len({tuple(trial.params.values()) for trial in counted}) == TRIALS
     for trial in counted:
-        assert json.loads(now[f"{trial.number:04d}"])["scores"] == trial.values
+        scores = json.loads(now[f"{trial.number:04d}"])["scores"]
+        assert finished.folder.config.signed(scores) == trial.values
 
 
 def test_the_other_call_finished_the_study(finished):

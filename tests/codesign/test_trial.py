@@ -60,7 +60,7 @@ def test_complete(study, pretend):
     with TrialQueue(folder) as queue:
         found = run_trial(folder, trial := queue.claim())
         queue.finish(found)
-        assert queue.study.trials[0].value == found.score == pytest.approx(-3e-3)
+        assert queue.study.trials[0].value == -found.score == pytest.approx(3e-3)
     config, initial = pretend.train[0]
     assert str(initial) == "start.safetensors"
     assert config.environment.design == {**folder.config.baseline, **trial.params}
@@ -121,7 +121,7 @@ def test_reports_of_a_continued_trial_are_not_repeated(study, pretend):
     folder = study(**TRAINED)
     with TrialQueue(folder) as queue:
         trial = queue.claim()
-        trial.report(0.15, 100)
+        trial.report(-0.15, 100)
         assert run_trial(folder, trial).curve == [[100, 0.15], [200, 0.4], [300, 0.6]]
 
 

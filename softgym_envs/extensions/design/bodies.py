@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -16,8 +16,11 @@ from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.backends.registry import make_backend
 from softgym_envs.codesign.metrics.metric import Metric, find_metric
 from softgym_envs.codesign.metrics.sources import STATES
+from softgym_envs.codesign.records import Score
+from softgym_envs.codesign.scoring import Evaluator
 from softgym_envs.codesign.variables import split_values
 from softgym_envs.errors import ConfigError
+from softgym_envs.executors import parallel_map
 from softgym_envs.extensions.design.metrics import ActuationPath
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Robot
@@ -25,6 +28,7 @@ from softgym_envs.surrogate.potential.model import Model
 from softgym_envs.surrogate.potential.torch import TorchModel
 from softgym_envs.surrogate.pretrained import pretrained_model
 
+Key = TypeVar("Key")
 RobotMaker = Callable[[Mapping[str, float]], Robot]
 """Makes a robot with other values of its options, ``{"robot.<option>": value}``."""
 
@@ -129,8 +133,8 @@ class Body:
         )
 
 
-class Evaluator:
-    """Metrics of one design at a time, on FEM or on a surrogate.
+class StateEvaluator(Evaluator):
+    """Scores one design at a time by its states along an actuation, on FEM or on a surrogate.
 
     Args:
         robot: the robot.
@@ -158,7 +162,7 @@ class Evaluator:
         make_robot: RobotMaker | None = None,
         sources: Mapping[str, Any] | None = None,
     ) -> None:
-        self.metrics = check_metrics(robot, metrics, backend, sources)
+        super().__init__(check_metrics(robot, metrics, backend, sources))
         self.settings = read_settings(self.metrics, sources or {})
         self.robot = robot
         self.command = full_command(robot, actuation)
@@ -176,16 +180,21 @@ class Evaluator:
             self.robot, self._options = self._make_robot(options), options
         return Body(self.robot, design, self.backend, self._backend_options, self.command, self.steps, self.settings)
 
-    def __call__(self, design: Mapping[str, float]) -> dict[str, float]:
-        """Return the metrics of a complete design by name [SI].
-
-        Raises:
-            InfeasibleDesign: if the body cannot exist.
-            ConvergenceError: if it has no equilibrium.
-        """
+    def measure(self, design: Mapping[str, float]) -> dict[str, float]:
         body = self.body(design)
         read = cache(lambda source: source.read(body))
         return {metric.name: float(metric(read(metric.source))) for metric in self.metrics}
+
+
+def evaluate_each(
+    evaluator: Evaluator, designs: Iterable[tuple[Key, Mapping[str, float]]], workers: int
+) -> Iterator[tuple[Key, Score]]:
+    """Score designs, each with a key, on several processes; yields each key with its score, in any order."""
+    yield from parallel_map(_evaluate_one, [(key, evaluator, design) for key, design in designs], workers)
+
+
+def _evaluate_one(key: Key, evaluator: Evaluator, design: Mapping[str, float]) -> tuple[Key, Score]:
+    return key, evaluator(design)
 
 
 def _stack(arrays: list[np.ndarray]) -> Tensor:
@@ -202,10 +211,10 @@ class LearnedBodies:
     """Metrics of a batch of designs on a surrogate, with gradients.
 
     Actuators are where they are commanded to be: no cable hangs slack. Rest is zero displacement. The arguments are
-    those of `Evaluator`.
+    those of `StateEvaluator`.
 
     Raises:
-        ConfigError: as for `Evaluator`, for metrics without gradients, and for weights of another kind of network.
+        ConfigError: as for `StateEvaluator`, for metrics without gradients, and for weights of another kind of network.
     """
 
     def __init__(

@@ -7,13 +7,13 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from softgym_envs.codesign.metrics.metric import Metric, find_metric, metric_name
+from softgym_envs.codesign.metrics.metric import Direction, Metric, find_metric, metric_name
 from softgym_envs.codesign.sampling import SamplerConfig
 from softgym_envs.codesign.variables import OptionRange, change_options
 from softgym_envs.config import BesideConfig, Config
 from softgym_envs.extensions.design.bodies import (
-    Evaluator,
     LearnedBodies,
+    StateEvaluator,
     check_derivatives,
     check_metrics,
     full_command,
@@ -91,10 +91,10 @@ class BodiesConfig(RobotConfig):
         """Return the designs under consideration."""
         return Box(self.make_robot().design_space, self.variables, self.bounds, self.design, self.ranges)
 
-    def evaluator(self, metrics: tuple[str, ...], backend: str | None = None) -> Evaluator:
+    def evaluator(self, metrics: tuple[str, ...], backend: str | None = None) -> StateEvaluator:
         """Return the evaluator of single designs, on the configured backend or another one."""
         backend = self.backend if backend is None else backend
-        return Evaluator(
+        return StateEvaluator(
             self.make_robot(),
             metrics,
             backend=backend,
@@ -130,12 +130,24 @@ class ObjectiveConfig(Config):
         """Return the metric."""
         return find_metric(self.metric)
 
+    @property
+    def direction(self) -> Direction:
+        """Direction of `value`."""
+        goal = self.find().direction if self.goal is None else self.goal
+        return "minimize" if isinstance(goal, float) else goal
+
+    @property
+    def title(self) -> str:
+        """Name of `value`, with its unit."""
+        return f"{self.find().stored_name}{' off its target' if isinstance(self.goal, float) else ''}"
+
+    def value(self, value: Any) -> Any:
+        """Return a value of the metric [SI], or its distance to the target (a number, an array or a tensor)."""
+        return abs(value - self.goal) if isinstance(self.goal, float) else value
+
     def cost(self, value: Any) -> Any:
         """Return the cost to minimise for a value of the metric [SI] (a number, an array or a tensor)."""
-        goal = self.find().direction if self.goal is None else self.goal
-        if isinstance(goal, float):
-            return abs(value - goal)
-        return -value if goal == "maximize" else value
+        return -self.value(value) if self.direction == "maximize" else self.value(value)
 
 
 class SearchConfig(Config):

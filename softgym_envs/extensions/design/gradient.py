@@ -163,6 +163,6 @@ def _optimise(config: OptimiseConfig) -> tuple[GradientResult, WeightedCost]:
     seconds = time.perf_counter() - began
     best = min(descents, key=lambda descent: descent.cost)
     # Unlike the gradients, the backend lets cables hang slack: its values count.
-    surrogate = bodies.evaluator(config.metrics, "surrogate")(best.end)
-    fem = bodies.evaluator(config.metrics, "fem")(best.end) if solver.check else None
+    surrogate = bodies.evaluator(config.metrics, "surrogate").measure(best.end)
+    fem = bodies.evaluator(config.metrics, "fem").measure(best.end) if solver.check else None
     return GradientResult(BestDesign(best.end, best.cost, surrogate, fem), descents, len(cost.points), seconds), cost

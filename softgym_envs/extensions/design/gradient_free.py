@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from softgym_envs.codesign.records import Score
 from softgym_envs.codesign.sampling import make_sampler
 from softgym_envs.codesign.scheduling.journal import open_journal
-from softgym_envs.codesign.scheduling.optuna_study import trial_id
+from softgym_envs.codesign.scheduling.optuna_study import distributions, name_metrics, tell, trial_id
+from softgym_envs.codesign.search import run_search
 from softgym_envs.errors import ConvergenceError
+from softgym_envs.extensions.design.bodies import evaluate_each
 from softgym_envs.extensions.design.config import OptimiseConfig, SearchConfig
-from softgym_envs.extensions.design.evaluation import Evaluation, evaluate_each
 from softgym_envs.extensions.design.plots import draw_front
 from softgym_envs.extensions.design.records import FrontDesign, SearchResult
 from softgym_envs.runs import RunFolder
@@ -42,19 +44,31 @@ def search(config: OptimiseConfig, folder: str | Path, *, progress: bool = True)
         ConfigError: if the folder holds results of another configuration or tool, or another process uses it.
         ConvergenceError: if no design is feasible.
     """
+    import click
+
     may_change = ("name", "workers", "solver.trials")
     run = RunFolder(folder, OptimiseConfig, "a search")
     with run.reserve(config, may_change, progress=progress) as place:
-        study = _Search(config, place)
-        study.run(progress)
-        result, values, front = study.result()
+        ledger = _Ledger(config, place)
+        evaluator = config.bodies.evaluator(config.metrics)
+        with click.progressbar(length=ledger.solver.trials, label="designs", hidden=not progress) as bar:
+
+            def evaluate(trials: Sequence[Any]) -> Iterator[tuple[Any, Score]]:
+                by_number = {trial.number: trial for trial in trials}
+                designs = [(number, ledger.design(trial)) for number, trial in by_number.items()]
+                for number, score in evaluate_each(evaluator, designs, config.workers):
+                    yield by_number[number], score
+                    bar.update(ledger.done - bar.pos)
+
+            run_search(ledger, evaluate)
+        result, values, front = ledger.result()
         write_json(place / "result.json", {**run.stamp(), **result.to_json()})
-        study.write_table(place / "trials.csv")
+        ledger.write_table(place / "trials.csv")
         draw_front(place / "front.png", [o.find() for o in config.objectives], values, front)
     return result
 
 
-class _Search:
+class _Ledger:
     """The Optuna study of a search, in the journal of its folder.
 
     Args:
@@ -70,14 +84,18 @@ class _Search:
         self.config, self.solver = config, config.solver
         self.box = config.bodies.box()
         self._storage = open_journal(folder / "journal.log")
+        begun = self._storage.get_all_studies()
         self._study = optuna.create_study(
-            study_name="search",
+            study_name=begun[0].study_name if begun else config.name,
             storage=self._storage,
             load_if_exists=True,
-            directions=["minimize"] * len(config.objectives),
+            directions=[objective.direction for objective in config.objectives],
             sampler=make_sampler(self.solver.sampler, 0),
         )
+        name_metrics(self._study, [objective.title for objective in config.objectives])
         self._discard_unfinished_batch()
+        finished = (trial for trial in reversed(self.trials()) if trial.state.is_finished())
+        self._known = {self._key(trial): _score(trial) for trial in finished}
 
     def _discard_unfinished_batch(self) -> None:
         """Fail the trials of a batch that was interrupted while it was proposed; all of it is then proposed again.
@@ -97,31 +115,35 @@ class _Search:
         trials = self._study.get_trials(deepcopy=False)
         return [trial for trial in trials if "evaluation" in trial.user_attrs or not trial.state.is_finished()]
 
-    def run(self, progress: bool) -> None:
-        """Propose and evaluate designs until the search has as many trials as it should."""
-        import click
+    @property
+    def done(self) -> int:
+        """Number of finished trials."""
+        return sum(trial.state.is_finished() for trial in self.trials())
 
-        evaluator = self.config.bodies.evaluator(self.config.metrics)
-        known = {self._key(trial): _evaluation(trial) for trial in reversed(self.trials()) if trial.state.is_finished()}
-        with click.progressbar(length=self.solver.trials, label="designs", hidden=not progress) as bar:
-            while True:
-                trials = self.trials()
-                bar.update(sum(trial.state.is_finished() for trial in trials) - bar.pos)
-                batch: Sequence[Any] = [trial for trial in trials if not trial.state.is_finished()]
-                if not batch:
-                    if len(trials) >= self.solver.trials:
-                        return
-                    batch = self._propose(trials)
-                new = {self._key(trial): trial for trial in batch if self._key(trial) not in known}
-                for trial in batch:
-                    if new.get(self._key(trial)) is not trial and self._key(trial) in known:
-                        self._tell(trial, replace(known[self._key(trial)], seconds=0.0, repeated=True))
-                by_number = {trial.number: trial for trial in new.values()}
-                designs = [(number, {**self.box.reference, **trial.params}) for number, trial in by_number.items()]
-                for number, evaluation in evaluate_each(evaluator, designs, self.config.workers):
-                    known[self._key(by_number[number])] = evaluation
-                    self._tell(by_number[number], evaluation)
-                    bar.update(1)
+    def design(self, trial: optuna.trial.FrozenTrial | optuna.Trial) -> dict[str, float]:
+        """Return the complete design of a trial [SI]."""
+        return {**self.box.reference, **trial.params}
+
+    def ask(self) -> list[Any]:
+        """Return the trials of a batch that have no score yet; a design that is known has its score at once."""
+        while True:
+            trials = self.trials()
+            batch: Sequence[Any] = [trial for trial in trials if not trial.state.is_finished()]
+            if not batch:
+                if len(trials) >= self.solver.trials:
+                    return []
+                batch = self._propose(trials)
+            new = {self._key(trial): trial for trial in reversed(batch) if self._key(trial) not in self._known}
+            for trial in batch:
+                if (known := self._known.get(self._key(trial))) is not None:
+                    self._finish(trial, replace(known, seconds=0.0, cpu_seconds=0.0), repeated=True)
+            if new:
+                return sorted(new.values(), key=lambda trial: trial.number)
+
+    def tell(self, trial: optuna.trial.FrozenTrial | optuna.Trial, score: Score) -> None:
+        """Record the score of a design."""
+        self._known[self._key(trial)] = score
+        self._finish(trial, score)
 
     def _propose(self, trials: Sequence[optuna.trial.FrozenTrial]) -> list[optuna.Trial]:
         """Ask the sampler for the rest of a batch."""
@@ -130,45 +152,39 @@ class _Search:
         solver = self.solver
         complete = sum(trial.state == optuna.trial.TrialState.COMPLETE for trial in trials)
         missing = min(solver.batch - complete % solver.batch, solver.trials - len(trials))
-        distributions: dict[str, optuna.distributions.BaseDistribution] = {
-            name: optuna.distributions.FloatDistribution(variable.low, variable.high, log=variable.log)
-            for name, variable in self.box.free.variables.items()
-        }
         batch = []
         for number in range(len(trials), len(trials) + missing):
             self._study.sampler = make_sampler(solver.sampler, number)
             if number < len(solver.starts):
                 values = self.box.free.complete(solver.starts[number])
                 self._study.enqueue_trial({name: values[name] for name in self.box.names})
-            batch.append(self._study.ask(distributions))
+            batch.append(self._study.ask(distributions(self.box.free.variables)))
         self._study.set_user_attr("proposed", batch[-1].number + 1)
         return batch
 
     def _key(self, trial: optuna.trial.FrozenTrial | optuna.Trial) -> tuple[float, ...]:
         return tuple(trial.params[name] for name in self.box.names)
 
-    def _tell(self, trial: optuna.trial.FrozenTrial | optuna.Trial, evaluation: Evaluation) -> None:
-        import optuna
-
+    def _finish(self, trial: optuna.trial.FrozenTrial | optuna.Trial, score: Score, *, repeated: bool = False) -> None:
         known = trial_id(self._storage, self._study, trial.number)
-        self._storage.set_trial_user_attr(known, "evaluation", evaluation.to_json())
-        if evaluation.feasible:
-            objectives = self.config.objectives
-            self._study.tell(trial.number, [float(o.cost(evaluation.metrics[o.find().name])) for o in objectives])
-        else:
-            self._study.tell(trial.number, state=optuna.trial.TrialState.FAIL)
+        self._storage.set_trial_user_attr(known, "repeated", repeated)
+        self._storage.set_trial_user_attr(known, "evaluation", score.to_json())
+        objectives = self.config.objectives if score.feasible else ()
+        tell(self._study, trial.number, [float(o.value(score.values[o.find().name])) for o in objectives])
 
     def result(self) -> tuple[SearchResult, np.ndarray, np.ndarray]:
         """Return the result, the metrics (n, m) [SI] of all feasible designs, and the indices of the front in them."""
         names = [objective.find().name for objective in self.config.objectives]
-        evaluations = [_evaluation(trial) for trial in self.trials()]
-        feasible = [trial for trial in self.trials() if trial.values is not None]
+        trials = self.trials()
+        scores = [_score(trial) for trial in trials]
+        feasible = [trial for trial, score in zip(trials, scores, strict=True) if score.feasible]
         if not feasible:
             raise ConvergenceError(
-                f"none of {counted(len(evaluations), 'design')} is feasible; the first: {evaluations[0].infeasible}"
+                f"none of {counted(len(trials), 'design')} is feasible; the first: {scores[0].reason}"
             )
-        best = [trial for trial in self._study.best_trials if not _evaluation(trial).repeated]
-        best.sort(key=lambda trial: (trial.values[0], trial.number))
+        best = [trial for trial in self._study.best_trials if not trial.user_attrs["repeated"]]
+        first = self.config.objectives[0]
+        best.sort(key=lambda trial: (first.cost(_score(trial).values[names[0]]), trial.number))
         if len(names) == 1:
             best = best[:1]
         place = {trial.number: k for k, trial in enumerate(feasible)}
@@ -176,17 +192,17 @@ class _Search:
             front=[
                 FrontDesign(
                     trial=trial.number,
-                    design={**self.box.reference, **trial.params},
-                    metrics=_evaluation(trial).metrics,
+                    design=self.design(trial),
+                    metrics=_score(trial).values,
                 )
                 for trial in best
             ],
             feasible=len(feasible),
-            infeasible=len(evaluations) - len(feasible),
-            repeated=sum(evaluation.repeated for evaluation in evaluations),
-            busy_seconds=sum(evaluation.seconds for evaluation in evaluations),
+            infeasible=len(trials) - len(feasible),
+            repeated=sum(trial.user_attrs["repeated"] for trial in trials),
+            busy_seconds=sum(score.seconds for score in scores),
         )
-        values = np.array([[_evaluation(trial).metrics[name] for name in names] for trial in feasible])
+        values = np.array([[_score(trial).values[name] for name in names] for trial in feasible])
         return result, values, np.array([place[trial.number] for trial in best])
 
     def write_table(self, path: Path) -> None:
@@ -196,13 +212,11 @@ class _Search:
             writer = csv.writer(stream, lineterminator="\n")
             writer.writerow(["trial", *self.box.names, *names, "infeasible", "seconds"])
             for trial in self.trials():
-                evaluation = _evaluation(trial)
-                metrics = [repr(evaluation.metrics[name]) if evaluation.feasible else "" for name in names]
+                score = _score(trial)
+                metrics = [repr(score.values[name]) if score.feasible else "" for name in names]
                 design = [repr(trial.params[name]) for name in self.box.names]
-                writer.writerow(
-                    [trial.number, *design, *metrics, evaluation.infeasible or "", f"{evaluation.seconds:.3f}"]
-                )
+                writer.writerow([trial.number, *design, *metrics, score.reason or "", f"{score.seconds:.3f}"])
 
 
-def _evaluation(trial: optuna.trial.FrozenTrial) -> Evaluation:
-    return Evaluation.from_json(trial.user_attrs["evaluation"])
+def _score(trial: optuna.trial.FrozenTrial) -> Score:
+    return Score.from_json(trial.user_attrs["evaluation"])

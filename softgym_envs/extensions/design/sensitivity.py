@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.codesign.metrics.metric import find_metric
+from softgym_envs.codesign.records import Score
+from softgym_envs.codesign.scoring import Evaluator
 from softgym_envs.errors import ConfigError, ConvergenceError, DataError
-from softgym_envs.extensions.design.bodies import Evaluator
+from softgym_envs.extensions.design.bodies import evaluate_each
 from softgym_envs.extensions.design.box import Box
 from softgym_envs.extensions.design.config import SensitivityConfig
-from softgym_envs.extensions.design.evaluation import Evaluation, evaluate_each
 from softgym_envs.extensions.design.plots import draw_sensitivity
 from softgym_envs.extensions.design.records import SensitivityResult
 from softgym_envs.runs import RunFolder
@@ -138,7 +139,7 @@ def evaluate_all(
     *,
     workers: int = 1,
     progress: bool = True,
-) -> list[Evaluation]:
+) -> list[Score]:
     """Return the evaluations of complete designs [SI]; those that a file of JSON lines holds are not computed again.
 
     Raises:
@@ -147,11 +148,11 @@ def evaluate_all(
     import click
 
     lines = JsonLines(path)
-    found: dict[int, Evaluation] = {}
+    found: dict[int, Score] = {}
     for record in lines.read():
         try:
             number = record.pop("number")
-            found[number] = Evaluation.from_json(record)
+            found[number] = Score.from_json(record)
         except (KeyError, DataError) as error:
             raise DataError(f"'{path}' holds a line that is not an evaluation: {error}") from None
     missing = [(k, design) for k, design in enumerate(designs) if k not in found]
@@ -203,10 +204,12 @@ def _analyse(config: SensitivityConfig, folder: Path, progress: bool) -> Sensiti
         progress=progress,
     )
     if config.method == "oat" and not evaluations[0].feasible:
-        raise ConvergenceError(f"the reference design is infeasible: {evaluations[0].infeasible}")
+        raise ConvergenceError(f"the reference design is infeasible: {evaluations[0].reason}")
     indices: dict[str, Table] = {}
     for metric in map(find_metric, config.metrics):
-        values = np.array([evaluation.metrics.get(metric.name, np.nan) for evaluation in evaluations])
+        values = np.array(
+            [evaluation.values[metric.name] if evaluation.feasible else np.nan for evaluation in evaluations]
+        )
         if config.method == "oat":
             indices[metric.name] = one_at_a_time(points, values, box)
         elif config.method == "morris":

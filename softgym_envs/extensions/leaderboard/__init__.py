@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from softgym_envs.extensions.leaderboard.frozen import FrozenProblem as FrozenProblem
     from softgym_envs.extensions.leaderboard.frozen import load_problem as load_problem
     from softgym_envs.extensions.leaderboard.frozen import problem_names as problem_names
-    from softgym_envs.extensions.leaderboard.problem import Score as Score
+    from softgym_envs.extensions.leaderboard.problem import JudgedScore as JudgedScore
     from softgym_envs.extensions.leaderboard.search import Search as Search
     from softgym_envs.extensions.leaderboard.submission import Submission as Submission
     from softgym_envs.extensions.leaderboard.submission import submit as submit
@@ -22,7 +22,7 @@ __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
     {
         "frozen": ["FrozenProblem", "load_problem", "problem_names"],
-        "problem": ["Score"],
+        "problem": ["JudgedScore"],
         "search": ["Search"],
         "submission": ["Submission", "submit", "verify"],
     },

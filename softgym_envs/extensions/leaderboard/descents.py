@@ -18,7 +18,7 @@ from softgym_envs.extensions.design.box import Box
 from softgym_envs.extensions.design.gradient import descend
 from softgym_envs.extensions.leaderboard.clock import working_seconds
 from softgym_envs.extensions.leaderboard.frozen import FrozenProblem
-from softgym_envs.extensions.leaderboard.problem import Score
+from softgym_envs.extensions.leaderboard.problem import JudgedScore
 from softgym_envs.extensions.leaderboard.rest import settle
 
 if TYPE_CHECKING:
@@ -178,7 +178,7 @@ class GradientOptimiser:
         design = cost.box.design(point)
         return {name: design[name] for name in self._names}
 
-    def tell(self, score: Score) -> None:
+    def tell(self, score: JudgedScore) -> None:
         """Learn nothing: descents do not depend on scores."""
 
     def take_charge(self) -> tuple[int, float]:

@@ -18,9 +18,9 @@ from softgym_envs.errors import ConfigError, DataError, unknown_name
 from softgym_envs.extensions.leaderboard.problem import (
     GOAL_SETS,
     BenchmarkProblem,
-    Evaluator,
     Judge,
-    Score,
+    JudgedEvaluator,
+    JudgedScore,
     goal_key,
 )
 from softgym_envs.storage import atomic_write, read_json
@@ -202,7 +202,7 @@ class FrozenProblem:
         seed: int = 0,
         initial: Path | None = None,
         keep: Path | None = None,
-    ) -> Score:
+    ) -> JudgedScore:
         """Score a body on the search goals.
 
         Args:
@@ -220,15 +220,15 @@ class FrozenProblem:
         evaluator, judge = self.evaluator("search"), judge or self.definition.judge
         return evaluator(design, judge, share=budget, seed=seed, initial=initial, keep=keep)
 
-    def evaluator(self, goals: str, backend: str | None = None) -> Evaluator:
+    def evaluator(self, goals: str, backend: str | None = None) -> JudgedEvaluator:
         """Return the evaluator on one set of goals."""
+        return JudgedEvaluator(self.definition, self.training_goals, self.goals[goals], backend)
+
+    @property
+    def training_goals(self) -> np.ndarray:
+        """Goals of trainings [m], shape (k, 3); none for a task with paths."""
         training = self.goals["training"]
-        return Evaluator(
-            self.definition,
-            training[:, 0] if training.shape[1] == 1 else np.zeros((0, 3)),
-            self.goals[goals],
-            backend,
-        )
+        return training[:, 0] if training.shape[1] == 1 else np.zeros((0, 3))
 
     @cached_property
     def test_keys(self) -> frozenset[str]:

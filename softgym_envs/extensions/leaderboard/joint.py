@@ -11,13 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from softgym_envs.agents.config import TrainConfig
 from softgym_envs.agents.joint import PROPOSERS
 from softgym_envs.agents.training import train
 from softgym_envs.codesign.parts import JointConfig
 from softgym_envs.extensions.leaderboard.clock import working_seconds
 from softgym_envs.extensions.leaderboard.frozen import FrozenProblem
-from softgym_envs.extensions.leaderboard.problem import Score
+from softgym_envs.extensions.leaderboard.problem import JudgedScore
 from softgym_envs.storage import read_json
 
 STEPS = 20_000
@@ -84,7 +83,7 @@ class JointOptimiser:
             return self._bodies.pop(0)
         return self._problem.design(self._rng.uniform(-1.0, 1.0, len(self._problem.variables)))
 
-    def tell(self, score: Score) -> None:
+    def tell(self, score: JudgedScore) -> None:
         """Learn nothing: the bodies follow from the training."""
 
     def take_charge(self) -> tuple[int, float]:
@@ -111,13 +110,9 @@ class JointOptimiser:
                 "sac": sac,
             }
         )
-        update: dict[str, object] = {"design": dict(definition.baseline), "sample_design": list(definition.variables)}
-        goals = self._problem.goals["training"]
-        if goals.shape[1] == 1:
-            options = {**definition.environment.task_options, "goals": goals[:, 0].tolist()}
-            update["task_options"] = options
-        environment = definition.environment.model_copy(update=update)
-        config = TrainConfig(environment=environment, **joint.model_dump(exclude={"keep", "options"}))
+        config = joint.on(
+            definition.environment, self._problem.training_goals, definition.baseline, list(definition.variables)
+        )
         folder = _Folder()
         settings: dict[str, Any] = {"warmup": min(WARM_UP, steps // 4)}
         proposer = PROPOSERS[self._proposer](**settings)
@@ -167,7 +162,7 @@ class InheritanceOptimiser:
             self._point = np.clip(parent + MUTATION * self._rng.standard_normal(size), -1.0, 1.0)
         return self._problem.design(self._point)
 
-    def tell(self, score: Score) -> None:
+    def tell(self, score: JudgedScore) -> None:
         """Keep a body that is better than the worst one."""
         if not score.feasible:
             return

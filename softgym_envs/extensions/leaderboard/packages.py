@@ -14,7 +14,7 @@ import numpy as np
 
 from softgym_envs.codesign.sampling import construct
 from softgym_envs.extensions.leaderboard.frozen import FrozenProblem
-from softgym_envs.extensions.leaderboard.problem import Score
+from softgym_envs.extensions.leaderboard.problem import JudgedScore
 from softgym_envs.extensions.leaderboard.search import OptunaOptimiser
 from softgym_envs.extras import require
 
@@ -102,7 +102,7 @@ class QualityDiversityOptimiser:
             self._waiting = list(self._scheduler.ask())
         return self._problem.design(self._waiting[0])
 
-    def tell(self, score: Score) -> None:
+    def tell(self, score: JudgedScore) -> None:
         """Learn the outcome; an infeasible body counts as the worst of its generation."""
         self._told.append((score.score, self._waiting.pop(0)))
         if self._waiting:
@@ -168,7 +168,7 @@ class SmacOptimiser:
         values = dict(self._trial.config)
         return self._problem.design([values[f"x{i}"] for i in range(len(values))])
 
-    def tell(self, score: Score) -> None:
+    def tell(self, score: JudgedScore) -> None:
         """Learn the outcome; an infeasible body costs as much as the worst one so far."""
         from smac.runhistory.dataclasses import TrialValue
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -17,11 +17,12 @@ from softgym_envs.agents.training import train
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.goals import draw_goals
 from softgym_envs.codesign.parts import GoalsConfig, TrainingConfig, ZoneConfig
-from softgym_envs.codesign.phases.trial import assess
+from softgym_envs.codesign.phases.trial import assess, rate
 from softgym_envs.codesign.problem import StudyProblem, refuse
-from softgym_envs.codesign.records import Record
+from softgym_envs.codesign.records import Score
+from softgym_envs.codesign.scoring import scoring
 from softgym_envs.config import BesideConfig, Config
-from softgym_envs.errors import ConvergenceError, DesignError, InfeasibleDesign, unknown_name
+from softgym_envs.errors import DesignError, unknown_name
 from softgym_envs.extensions.leaderboard.clock import working_seconds
 
 Judge = Literal["qp", "shared", "trained"]
@@ -152,23 +153,13 @@ class BenchmarkProblem(StudyProblem):
 
 
 @dataclass(eq=False)
-class Score(Record):
-    """Outcome and cost of one body under one judge."""
+class JudgedScore(Score):
+    """Score of one body under one judge."""
 
-    design: dict[str, float]  # values of the variables [SI]
     judge: str
     share: float = 1.0  # of the goals and of the training's steps
-    values: dict[str, float] = field(default_factory=dict)  # of each objective [SI]; empty if infeasible
-    scores: list[float] = field(default_factory=list)  # of the objectives, larger is better; empty if infeasible
-    reason: str | None = None  # why the body is infeasible
     environment_steps: int = 0
     fem_solves: int = 0
-    cpu_seconds: float = 0.0
-
-    @property
-    def feasible(self) -> bool:
-        """Whether the body exists and could be simulated."""
-        return self.reason is None
 
     @property
     def score(self) -> float:
@@ -177,8 +168,8 @@ class Score(Record):
 
 
 @dataclass(frozen=True)
-class Evaluator:
-    """Scores bodies of a problem on given goals.
+class JudgedEvaluator:
+    """Scores bodies of a problem on given goals, each under the judge that the call names.
 
     Args:
         problem: the problem.
@@ -202,7 +193,7 @@ class Evaluator:
         policy: Path | None = None,
         initial: Path | None = None,
         keep: Path | None = None,
-    ) -> Score:
+    ) -> JudgedScore:
         """Score one body.
 
         Args:
@@ -225,32 +216,25 @@ class Evaluator:
             raise ValueError(f"budget = {share} must be a share in (0, 1]")
         values = problem.checked(values)
         design, options = problem.body(values)
-        result = Score(values, judge, share)
+        result = JudgedScore(judge, share, design=values)
         goals = self.goals[: max(1, round(share * len(self.goals)))]
         environment = problem.environment_of(options)
         tested = environment if self.backend is None else environment.on(self.backend)
-        began = working_seconds()
-        try:
-            with tempfile.TemporaryDirectory() as folder:
-                agent: str | Path = {"qp": "qp", "shared": problem.policy or ""}.get(judge, "")
-                if policy is not None:
-                    agent = policy
-                elif judge == "trained":
-                    config = self._training(design, options, share, seed)
-                    start = initial or problem.policy
-                    agent = train(config, Path(keep or folder) / "policy", initial=start, progress=False)
-                    result.environment_steps += self.training_steps(share)
-                found = assess(agent, problem, tested, goals, design)
-            result.values = {name: float(value) for name, value in found.values.items()}
+        with scoring(result, working_seconds), tempfile.TemporaryDirectory() as folder:
+            agent: str | Path = {"qp": "qp", "shared": problem.policy or ""}.get(judge, "")
+            if policy is not None:
+                agent = policy
+            elif judge == "trained":
+                config = self._training(design, options, share, seed)
+                start = initial or problem.policy
+                agent = train(config, Path(keep or folder) / "policy", initial=start, progress=False)
+                result.environment_steps += self.training_steps(share)
+            found = assess(agent, problem, tested, goals, design)
+            rate(result, problem, found)
             result.environment_steps += found.evaluation.steps
             result.fem_solves = found.evaluation.steps if tested.backend == "fem" else 0
-            names = (problem.objective, *problem.secondary_objectives)
-            result.scores = [problem.objectives[name].score(result.values[name]) for name in names]
             if broken := problem.violations_text(result.values, problem.constraints):
                 result.reason, result.scores = broken, []
-        except (InfeasibleDesign, ConvergenceError) as error:
-            result.reason = str(error)
-        result.cpu_seconds = working_seconds() - began
         return result
 
     def training_steps(self, share: float = 1.0) -> int:
@@ -267,24 +251,10 @@ class Evaluator:
         self, design: Mapping[str, float], options: Mapping[str, float], share: float, seed: int
     ) -> TrainConfig:
         problem, training = self.problem, self.problem.training
-        environment = problem.environment_of(options)
-        goals = {"goals": self.training_goals.tolist()} if len(self.training_goals) else {}
         steps = self._steps(share)
-        return TrainConfig(
-            environment=environment.model_copy(
-                update={
-                    "design": dict(design),
-                    "sample_design": False,
-                    "task_options": {**environment.task_options, **goals},
-                }
-            ),
-            **{
-                **training.model_dump(),
-                "steps": steps,
-                "report_every": min(steps, training.report_every),
-                "seed": training.seed + seed,
-            },
-        )
+        shorter: dict[str, Any] = {"steps": steps, "report_every": min(steps, training.report_every)}
+        shorter["seed"] = training.seed + seed
+        return training.on(problem.environment_of(options), self.training_goals, design, **shorter)
 
 
 def goal_key(goal: np.ndarray) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 
 from softgym_envs.codesign.records import Record
 from softgym_envs.extensions.leaderboard.frozen import FrozenProblem, load_problem, problem_names
-from softgym_envs.extensions.leaderboard.problem import Judge, Score
+from softgym_envs.extensions.leaderboard.problem import Judge, JudgedScore
 from softgym_envs.extensions.leaderboard.scoring import DATA, front
 from softgym_envs.extensions.leaderboard.search import Search, make_optimiser, solve
 from softgym_envs.extensions.leaderboard.table import Table, TableSearch
@@ -134,12 +134,12 @@ def _curve(search: Search) -> list[list[float]]:
     return rows
 
 
-def _unseen(problem: FrozenProblem, winners: Sequence[Score], folder: Path) -> list[float]:
+def _unseen(problem: FrozenProblem, winners: Sequence[JudgedScore], folder: Path) -> list[float]:
     designs = [problem.definition.baseline_values, *(row.design for row in winners)]
     return [tested(problem, design, "qp", "validation", None, folder).score for design in designs]
 
 
-def _diversity(problem: FrozenProblem, rows: Sequence[Score]) -> float:
+def _diversity(problem: FrozenProblem, rows: Sequence[JudgedScore]) -> float:
     variables = problem.definition.optimised
     points = np.array([[float(variables[n].to_unit(value)) for n, value in row.design.items()] for row in rows])
     if len(points) < 2:
@@ -157,13 +157,13 @@ def tested(
     backend: str | None,
     folder: Path,
     seed: int = 0,
-) -> Score:
+) -> JudgedScore:
     """Return the score of a body on a set of goals; computed once and kept in a folder."""
     point = [round(float(problem.definition.optimised[name].to_unit(value)), 6) for name, value in design.items()]
     key = json.dumps([problem.hash, point, judge, goals, backend, seed if judge == "trained" else 0])
     path = folder / "scores" / problem.name / f"{sha256(key.encode()).hexdigest()[:24]}.json"
     if path.is_file():
-        return Score.read(path)
+        return JudgedScore.read(path)
     found = problem.evaluator(goals, backend)(design, judge, seed=seed)
     found.write(path)
     return found
@@ -210,7 +210,7 @@ def _stored_test(problem: FrozenProblem, each: Run, folder: Path) -> list[list[f
         path = folder / "scores" / problem.name / f"{sha256(key.encode()).hexdigest()[:24]}.json"
         if not path.is_file():
             return None
-        found.append(Score.read(path).scores)
+        found.append(JudgedScore.read(path).scores)
     return found
 
 

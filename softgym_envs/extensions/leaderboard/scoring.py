@@ -13,7 +13,7 @@ from softgym_envs.agents.statistics import Estimate, bootstrap
 from softgym_envs.codesign.records import Record
 from softgym_envs.errors import DataError
 from softgym_envs.extensions.leaderboard.frozen import FrozenProblem
-from softgym_envs.extensions.leaderboard.problem import Score
+from softgym_envs.extensions.leaderboard.problem import JudgedScore
 from softgym_envs.storage import read_json, write_json
 
 DATA = Path(__file__).parent / "data"
@@ -143,7 +143,7 @@ def bounds_share(problem: FrozenProblem, design: dict[str, float]) -> float:
     return float(np.mean([abs(float(variables[name].to_unit(value))) > 0.98 for name, value in design.items()]))
 
 
-def front(rows: Sequence[Score], limit: int = 8) -> list[Score]:
+def front(rows: Sequence[JudgedScore], limit: int = 8) -> list[JudgedScore]:
     """Return bodies that no other one dominates, spread over the front if there are more than a limit.
 
     Of bodies with equal scores, which optimisers ask for again and again, the first is kept.

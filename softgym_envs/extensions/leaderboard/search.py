@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from softgym_envs.codesign.sampling import SamplerConfig, construct, make_sampler
-from softgym_envs.codesign.scheduling.optuna_study import distributions
+from softgym_envs.codesign.scheduling.optuna_study import distributions, tell
+from softgym_envs.codesign.search import run_search
 from softgym_envs.errors import SoftGymError, unknown_name
 from softgym_envs.extensions.leaderboard.clock import working_seconds
 from softgym_envs.extensions.leaderboard.frozen import FrozenProblem
-from softgym_envs.extensions.leaderboard.problem import LEVELS, Budget, Judge, Score
+from softgym_envs.extensions.leaderboard.problem import LEVELS, Budget, Judge, JudgedScore
 
 if TYPE_CHECKING:
     from optuna.samplers import BaseSampler
@@ -36,7 +37,7 @@ class Optimiser(Protocol):
     def ask(self) -> Mapping[str, float]:
         """Return the body to score next: a value of every variable [SI]."""
 
-    def tell(self, score: Score) -> None:
+    def tell(self, score: JudgedScore) -> None:
         """Learn the outcome of the body that `ask` returned last."""
 
 
@@ -59,7 +60,7 @@ class Search:
     judge: Judge | None = None
     seed: int = 0
     limit: int | None = None
-    ledger: list[Score] = field(default_factory=list)
+    ledger: list[JudgedScore] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         if self.level not in LEVELS:
@@ -93,7 +94,7 @@ class Search:
             allowed = min(allowed, self.limit * self.ledger[0].environment_steps)
         return allowed - self.spent["environment_steps"]
 
-    def evaluate(self, design: Mapping[str, float], budget: float = 1.0, **training: Path | None) -> Score:
+    def evaluate(self, design: Mapping[str, float], budget: float = 1.0, **training: Path | None) -> JudgedScore:
         """Score a body and write it into the ledger; see `FrozenProblem.evaluate`, also for options of trainings.
 
         Raises:
@@ -107,40 +108,64 @@ class Search:
         return row
 
     @property
-    def best(self) -> Score | None:
+    def best(self) -> JudgedScore | None:
         """The feasible body with the best score on all goals and steps; None if there is none."""
         whole = [row for row in self.ledger if row.feasible and row.share == 1.0]
         return max(whole, key=lambda row: row.score, default=None)
 
     @property
-    def incumbents(self) -> list[tuple[int, Score]]:
+    def incumbents(self) -> list[tuple[int, JudgedScore]]:
         """The bodies that were the best when they were scored, each with its place in the ledger."""
-        found: list[tuple[int, Score]] = []
+        found: list[tuple[int, JudgedScore]] = []
         for index, row in enumerate(self.ledger):
             if row.feasible and row.share == 1.0 and (not found or row.score > found[-1][1].score):
                 found.append((index, row))
         return found
 
 
-def solve(search: Search, optimiser: Optimiser) -> float:
-    """Run an optimiser until the budget is spent; return its own CPU time [s].
+@dataclass(frozen=True)
+class _Budgeted:
+    """The ledger of a search, with an optimiser as its proposer."""
 
-    The first body is the baseline, for every optimiser.
-    """
-    began = working_seconds()
-    if not search.ledger:
-        search.evaluate(search.problem.definition.baseline_values)
-    charges = hasattr(optimiser, "take_charge")
-    while search.open:
-        if charges:
-            optimiser.steps_left = search.steps_left - search.ledger[0].environment_steps  # type: ignore[attr-defined]
-        design = optimiser.ask()
-        training = {name: getattr(optimiser, name) for name in ("initial", "keep") if hasattr(optimiser, name)}
-        row = search.evaluate(design, getattr(optimiser, "share", 1.0), **training)
-        if charges:
-            steps, seconds = optimiser.take_charge()  # type: ignore[attr-defined]
+    search: Search
+    optimiser: Any
+
+    def ask(self) -> list[Mapping[str, float]]:
+        """Return the next body; the first one is the baseline, for every optimiser."""
+        search, optimiser = self.search, self.optimiser
+        if not search.ledger:
+            return [search.problem.definition.baseline_values]
+        if not search.open:
+            return []
+        if hasattr(optimiser, "take_charge"):
+            optimiser.steps_left = search.steps_left - search.ledger[0].environment_steps
+        return [optimiser.ask()]
+
+    def evaluate(self, designs: Sequence[Mapping[str, float]]) -> Iterator[tuple[Mapping[str, float], JudgedScore]]:
+        """Score bodies, and write them into the ledger."""
+        search, optimiser = self.search, self.optimiser
+        for design in designs:
+            if not search.ledger:
+                yield design, search.evaluate(design)
+                continue
+            training = {name: getattr(optimiser, name) for name in ("initial", "keep") if hasattr(optimiser, name)}
+            yield design, search.evaluate(design, getattr(optimiser, "share", 1.0), **training)
+
+    def tell(self, design: Mapping[str, float], row: JudgedScore) -> None:
+        """Add what the optimiser spent itself to a row, and tell it the score; it did not ask for the baseline."""
+        if row is self.search.ledger[0]:
+            return
+        if hasattr(self.optimiser, "take_charge"):
+            steps, seconds = self.optimiser.take_charge()
             row.environment_steps, row.cpu_seconds = row.environment_steps + steps, row.cpu_seconds + seconds
-        optimiser.tell(row)
+        self.optimiser.tell(row)
+
+
+def solve(search: Search, optimiser: Optimiser) -> float:
+    """Run an optimiser until the budget is spent; return its own CPU time [s]."""
+    began = working_seconds()
+    ledger = _Budgeted(search, optimiser)
+    run_search(ledger, ledger.evaluate)
     return working_seconds() - began - search.spent["cpu_seconds"]
 
 
@@ -157,8 +182,8 @@ class OptunaOptimiser:
 
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         definition = problem.definition
-        self._study = optuna.create_study(directions=definition.directions, sampler=sampler)
-        self._ranges = distributions(definition)
+        self._study = optuna.create_study(directions=["maximize"] * definition.score_count, sampler=sampler)
+        self._ranges = distributions(definition.optimised)
         self._trial: Any = None
 
     def ask(self) -> Mapping[str, float]:
@@ -166,14 +191,9 @@ class OptunaOptimiser:
         self._trial = self._study.ask(self._ranges)
         return self._trial.params
 
-    def tell(self, score: Score) -> None:
-        """Learn the outcome; an infeasible body is a pruned trial."""
-        import optuna
-
-        if score.feasible:
-            self._study.tell(self._trial, score.scores)
-        else:
-            self._study.tell(self._trial, state=optuna.trial.TrialState.PRUNED)
+    def tell(self, score: JudgedScore) -> None:
+        """Learn the outcome."""
+        tell(self._study, self._trial.number, score.scores)
 
 
 class HalvingOptimiser:
@@ -195,7 +215,7 @@ class HalvingOptimiser:
         self._study = optuna.create_study(
             study_name=f"seed {sampler.seed}", direction="maximize", sampler=make_sampler(sampler, 0), pruner=pruner
         )
-        self._ranges = distributions(problem.definition)
+        self._ranges = distributions(problem.definition.optimised)
         self._trial: Any = None
         self._rung = 0
 
@@ -210,22 +230,19 @@ class HalvingOptimiser:
             self._trial = self._study.ask(self._ranges)
         return self._trial.params
 
-    def tell(self, score: Score) -> None:
+    def tell(self, score: JudgedScore) -> None:
         """Learn the outcome with the present share."""
-        import optuna
-
-        pruned = optuna.trial.TrialState.PRUNED
         resource, last = round(self.share / self.SHARES[0]), self._rung == len(self.SHARES) - 1
         self._rung = 0 if last or not score.feasible else self._rung + 1
         if not score.feasible:
-            self._study.tell(self._trial, state=pruned)
+            tell(self._study, self._trial.number)
             return
         self._trial.report(score.score, resource)
         if last:
-            self._study.tell(self._trial, score.score)
+            tell(self._study, self._trial.number, score.scores)
         elif self._trial.should_prune():
             self._rung = 0
-            self._study.tell(self._trial, state=pruned)
+            tell(self._study, self._trial.number)
 
 
 def _halving(pruner: str, **options: Any) -> Callable[[FrozenProblem, int], Optimiser]:

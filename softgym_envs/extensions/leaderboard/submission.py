@@ -26,7 +26,7 @@ from softgym_envs.errors import (
     unknown_name,
 )
 from softgym_envs.extensions.leaderboard.frozen import FrozenProblem, file_hash, load_problem
-from softgym_envs.extensions.leaderboard.problem import JUDGES, LEVELS, Budget, Evaluator, Score, goal_key
+from softgym_envs.extensions.leaderboard.problem import JUDGES, LEVELS, Budget, JudgedEvaluator, JudgedScore, goal_key
 from softgym_envs.extensions.leaderboard.scoring import (
     DATA,
     Reference,
@@ -132,7 +132,7 @@ class Submission(Record):
         found = _typed(cls, data, "the submission")
         _check_numbers(found)
         for number, row in enumerate(found.ledger):
-            _check_score(_typed(Score, row, f"ledger.{number}"), f"ledger.{number}")
+            _check_score(_typed(JudgedScore, row, f"ledger.{number}"), f"ledger.{number}")
         return found
 
 
@@ -149,7 +149,7 @@ def _check_numbers(found: Submission) -> None:
             raise DataError(f"the submission: {name} holds numbers that are not finite")
 
 
-def _check_score(row: Score, where: str) -> None:
+def _check_score(row: JudgedScore, where: str) -> None:
     """Raise DataError for a row of a ledger that no search writes."""
     for name, numbers in (("design", row.design.values()), ("values", row.values.values()), ("scores", row.scores)):
         if not all(map(isfinite, numbers)):
@@ -365,9 +365,9 @@ def _checked_problem(submission: Submission) -> FrozenProblem:
     return problem
 
 
-def _checked_ledger(problem: FrozenProblem, submission: Submission) -> list[Score]:
+def _checked_ledger(problem: FrozenProblem, submission: Submission) -> list[JudgedScore]:
     """Return the ledger; it must hold each submitted body and keep to the budget."""
-    rows = [Score.from_json(row) for row in submission.ledger]
+    rows = [JudgedScore.from_json(row) for row in submission.ledger]
     limits = problem.definition.budgets[submission.level]  # type: ignore[index]
     for name in Budget.model_fields:
         for number, row in enumerate(rows):
@@ -438,7 +438,7 @@ def _checked_policy(problem: FrozenProblem, submission: Submission, folder: Path
 
 
 def _check_search_score(
-    problem: FrozenProblem, submission: Submission, rows: list[Score], policy: Path | None, known: Reference
+    problem: FrozenProblem, submission: Submission, rows: list[JudgedScore], policy: Path | None, known: Reference
 ) -> None:
     """Score each submitted body again on the search goals, as the search did."""
     evaluator, judge = problem.evaluator("search"), submission.judge
@@ -454,7 +454,7 @@ def _check_search_score(
             )
 
 
-def _trained_score(evaluator: Evaluator, row: Score, policy: Path, known: Reference) -> Score | None:
+def _trained_score(evaluator: JudgedEvaluator, row: JudgedScore, policy: Path, known: Reference) -> JudgedScore | None:
     """Return the score of a body under a submitted policy and the cost of training it; None if the search had another.
 
     A policy that is trained again differs as soon as a processor rounds differently.

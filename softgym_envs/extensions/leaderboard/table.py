@@ -19,7 +19,7 @@ import numpy as np
 from softgym_envs.agents.evaluation import evaluate
 from softgym_envs.errors import DataError, unknown_name
 from softgym_envs.extensions.leaderboard.frozen import FrozenProblem, load_problem
-from softgym_envs.extensions.leaderboard.problem import Judge, Score
+from softgym_envs.extensions.leaderboard.problem import Judge, JudgedScore
 from softgym_envs.extensions.leaderboard.rest import LONGEST, outcome, settle, settle_on_fem
 from softgym_envs.extensions.leaderboard.scoring import DATA
 from softgym_envs.extensions.leaderboard.search import Search
@@ -191,7 +191,7 @@ class TableSearch(Search):
         search.table = table
         return search
 
-    def evaluate(self, design: Mapping[str, float], budget: float = 1.0, **training: Path | None) -> Score:
+    def evaluate(self, design: Mapping[str, float], budget: float = 1.0, **training: Path | None) -> JudgedScore:
         """Return the score of the nearest listed body, on all goals."""
         definition = self.problem.definition
         design = definition.checked(design)
@@ -199,9 +199,9 @@ class TableSearch(Search):
         index = int(self.table.nearest(point[None], str(self.judge))[0])
         value = float(self.table.values[str(self.judge)][index, 0])
         steps = len(self.problem.goals["search"]) * definition.episode_steps
-        row = Score(
-            self.problem.design(self.table.points[index]),
+        row = JudgedScore(
             str(self.judge),
+            design=self.problem.design(self.table.points[index]),
             values={definition.objective: value},
             scores=[definition.primary.score(value)],
             environment_steps=steps,

@@ -10,7 +10,7 @@ from softgym_envs import make_robot
 from softgym_envs.codesign.metrics.metric import METRICS, Metric, find_metric, metric
 from softgym_envs.config import check_config, load_config
 from softgym_envs.errors import ConfigError
-from softgym_envs.extensions.design.bodies import Evaluator
+from softgym_envs.extensions.design.bodies import StateEvaluator
 from softgym_envs.extensions.design.config import BodiesConfig, ObjectiveConfig, OptimiseConfig, SensitivityConfig
 from softgym_envs.extensions.design.gradient_free import search
 from softgym_envs.extensions.design.sensitivity import analyse_sensitivity
@@ -55,8 +55,8 @@ def optimisation(objectives, **changes):
 
 def test_a_metric_of_the_design_and_one_of_the_states(importable):
     robot = make_robot("finger", cables=1)
-    evaluator = Evaluator(robot, [mass, tip_height, "travel"], backend="surrogate", actuation=[0.01])
-    found = evaluator(robot.design_space.baseline)
+    evaluator = StateEvaluator(robot, [mass, tip_height, "travel"], backend="surrogate", actuation=[0.01])
+    found = evaluator.measure(robot.design_space.baseline)
     assert found["mass"] == pytest.approx(1.1e3 * 3.0 * 0.04 * 0.021**2)
     assert -0.12 < found["tip_height"] < 0.0 < found["travel"]
     assert find_metric("own_metrics:mass") is mass and find_metric(tip_height) is tip_height
@@ -111,7 +111,7 @@ def test_a_robot_option_as_a_variable(tmp_path):
     with (tmp_path / "trials.csv").open() as stream:
         efforts = [float(row["effort"]) for row in csv.DictReader(stream)]
     robot = make_robot("press_finger", button_force=4.0)
-    direct = Evaluator(robot, ["effort"], actuation=[0.006, 0.006])(robot.design_space.baseline)["effort"]
+    direct = StateEvaluator(robot, ["effort"], actuation=[0.006, 0.006]).measure(robot.design_space.baseline)["effort"]
     assert efforts[2] == pytest.approx(direct) and len({round(effort, 6) for effort in efforts}) == 3
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from softgym_envs import make_robot
+from softgym_envs.codesign.scoring import Evaluator
 from softgym_envs.config import check_config, load_config
 from softgym_envs.errors import ConfigError, ConvergenceError, InfeasibleDesign
 from softgym_envs.extensions.design import calibration, gradient
@@ -37,13 +38,16 @@ def configured(**changes):
     return check_config(OptimiseConfig, {**data, **changes}, "test")
 
 
-class Stub:
+class Stub(Evaluator):
     """An evaluator with infeasible designs that stops after a number of evaluations."""
 
     stop = np.inf
     count = 0
 
-    def __call__(self, design):
+    def __init__(self):
+        super().__init__(())
+
+    def measure(self, design):
         Stub.count += 1
         if Stub.count > Stub.stop:
             raise KeyboardInterrupt
@@ -163,7 +167,7 @@ def test_two_searches_in_one_folder(stub, monkeypatch, tmp_path):
             search(configured(), tmp_path, progress=False)
         return {"bending_angle": design["length"], "contact_force": -design["length"]}
 
-    monkeypatch.setattr(stub, "__call__", other)
+    monkeypatch.setattr(stub, "measure", other)
     assert search(configured(), tmp_path, progress=False).feasible == 20
     assert search(configured(), tmp_path, progress=False).feasible == 20
 
@@ -172,7 +176,7 @@ def test_generations_of_nsga_are_full(stub, tmp_path):
     import optuna
 
     search(configured(), tmp_path, progress=False)
-    study = module._Search(configured(), tmp_path)._study
+    study = module._Ledger(configured(), tmp_path)._study
     generations = [
         trial.system_attrs["NSGAIISampler:generation"]
         for trial in study.get_trials(states=(optuna.trial.TrialState.COMPLETE,))
@@ -183,7 +187,7 @@ def test_generations_of_nsga_are_full(stub, tmp_path):
 def test_nothing_feasible(stub, tmp_path):
     bodies = {**BODIES, "bounds": {"joint_height": (0.0075, 0.008)}}
     with pytest.raises(
-        ConvergenceError, match="none of 20 designs is feasible; the first: InfeasibleDesign: too thick"
+        ConvergenceError, match="none of 20 designs is feasible; the first: too thick"
     ):
         search(configured(bodies=bodies), tmp_path, progress=False)
 

@@ -10,7 +10,7 @@ from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.codesign.metrics.metric import METRICS
 from softgym_envs.errors import ConfigError, DesignError, InfeasibleDesign
-from softgym_envs.extensions.design.bodies import Evaluator, LearnedBodies, full_command
+from softgym_envs.extensions.design.bodies import LearnedBodies, StateEvaluator, full_command
 from softgym_envs.extensions.design.box import Box
 from softgym_envs.extensions.sensing import metrics as sensors
 from softgym_envs.mechanics.solvers.statics import Statics
@@ -26,7 +26,7 @@ def finger():
 
 @pytest.fixture(scope="module")
 def on_fem(finger):
-    return Evaluator(finger, (*STATES, "material_volume"), actuation=[PULL], steps=2)({})
+    return StateEvaluator(finger, (*STATES, "material_volume"), actuation=[PULL], steps=2).measure({})
 
 
 def test_formulas_of_the_thesis_on_fem(finger, on_fem):
@@ -63,7 +63,7 @@ def test_normal_force_is_that_of_a_tip_blocked_sideways(finger, on_fem):
 
 
 def test_surrogate_and_torch_agree_with_fem(finger, on_fem):
-    surrogate = Evaluator(finger, STATES, backend="surrogate", actuation=[PULL], steps=2)({})
+    surrogate = StateEvaluator(finger, STATES, backend="surrogate", actuation=[PULL], steps=2).measure({})
     learned = LearnedBodies(finger, STATES, actuation=[PULL], steps=2)
     values = learned(torch.tensor(finger.design_space.baseline.array[None]))[0]
     for name, value in zip(STATES, values.tolist(), strict=True):
@@ -90,7 +90,7 @@ def test_gradients_are_derivatives(finger, name):
 def test_sensorized_finger_reads_what_the_robot_reads():
     robot = make_robot("sensorized_finger")
     names = ("volume_change", "relative_volume_change", "cavity_volume", "angular_displacement")
-    found, readings = Evaluator(robot, names, actuation=[PULL])({}), robot.readings()
+    found, readings = StateEvaluator(robot, names, actuation=[PULL]).measure({}), robot.readings()
     assert found["volume_change"] == pytest.approx(readings.volume_change)
     assert found["relative_volume_change"] == pytest.approx(readings.relative_volume_change)
     assert found["cavity_volume"] == pytest.approx(readings.initial_volume)
@@ -105,21 +105,21 @@ def test_a_cavity_whose_walls_pass_through_each_other_is_infeasible():
     design = {"slope": 0.5589782, **lengths}
     for name in ("relative_volume_change", "volume_change", "angular_displacement"):
         with pytest.raises(InfeasibleDesign, match="walls of 'cavity_1' pass through each other"):
-            Evaluator(robot, [name], actuation=[PULL])(design)
+            StateEvaluator(robot, [name], actuation=[PULL]).measure(design)
     with pytest.raises(InfeasibleDesign, match="walls of 'cavity_1' pass through each other"):
         robot.readings(design)
 
 
 def test_four_cavities_have_a_pressure_sensitivity():
     robot = make_robot("sensorized_finger", cavities=4)
-    found = Evaluator(robot, ["pressure_sensitivity"], actuation=[PULL])({})
+    found = StateEvaluator(robot, ["pressure_sensitivity"], actuation=[PULL]).measure({})
     assert found["pressure_sensitivity"] == robot.readings().pressure_sensitivity > 0.0
 
 
 def test_information_is_what_a_reading_takes_from_the_uncertainty():
     """Slopes against differences of equilibria, and the metric against determinants of covariances."""
     robot = make_robot("sensorized_finger")
-    evaluator = Evaluator(robot, ["information"], actuation=[PULL])
+    evaluator = StateEvaluator(robot, ["information"], actuation=[PULL])
     slopes = sensors.TOUCHES.read(evaluator.body({}))
     assert slopes.shape == (10, 2, 2)
     model = robot.build()
@@ -137,7 +137,7 @@ def test_information_is_what_a_reading_takes_from_the_uncertainty():
         before = np.diag([sensors.CABLE_ERROR, sensors.TOUCH_FORCE]) ** 2
         after = np.linalg.inv(np.linalg.inv(before) + slope.T @ slope / sensors.VOLUME_NOISE**2)
         gained.append(0.5 * np.log(np.linalg.det(before) / np.linalg.det(after)))
-    assert evaluator({})["information"] == pytest.approx(np.mean(gained))
+    assert evaluator.measure({})["information"] == pytest.approx(np.mean(gained))
     assert gained[0] < gained[8]  # near the flange a touch hardly changes a volume
 
 
@@ -152,12 +152,12 @@ def test_unavailable_metrics_and_wrong_actuations(finger):
         (["travel"], {"actuation": [0.01, 0.01]}, "allowed: cable_1 0 to 0.02 m"),
     ):
         with pytest.raises(ConfigError, match=words):
-            Evaluator(finger, names, **options)
+            StateEvaluator(finger, names, **options)
 
 
 def test_two_cavities_have_no_pressure_sensitivity():
     with pytest.raises(ConfigError, match="robot_options cavities: 4"):
-        Evaluator(make_robot("sensorized_finger"), ["pressure_sensitivity"])
+        StateEvaluator(make_robot("sensorized_finger"), ["pressure_sensitivity"])
 
 
 @pytest.mark.parametrize("name", ["finger", "diamond", "tetrapod"])

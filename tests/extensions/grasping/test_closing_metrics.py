@@ -10,9 +10,8 @@ import pytest
 from softgym_envs import make_robot
 from softgym_envs.config import load_config
 from softgym_envs.errors import ConfigError, ConvergenceError, InfeasibleDesign
-from softgym_envs.extensions.design.bodies import Evaluator
+from softgym_envs.extensions.design.bodies import StateEvaluator
 from softgym_envs.extensions.design.config import OptimiseConfig, SensitivityConfig
-from softgym_envs.extensions.design.evaluation import evaluate
 from softgym_envs.extensions.grasping.metrics import GraspConfig
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs" / "design"
@@ -62,23 +61,23 @@ def test_failed_grasps_are_infeasible_evaluations(finger, monkeypatch, status, e
     monkeypatch.setattr("softgym_envs.extensions.grasping.metrics.evaluate_grasp", lambda *a, **b: grasp_of(status))
     with pytest.raises(error, match="why"):
         GraspConfig().evaluate(finger, {})
-    found = evaluate(Evaluator(finger, ["grip_force"]), finger.design_space.baseline)
-    assert not found.feasible and found.infeasible == f"{error.__name__}: why"
+    found = StateEvaluator(finger, ["grip_force"])(finger.design_space.baseline)
+    assert not found.feasible and found.reason == "why"
 
 
 def test_metrics_are_means_over_grasps(finger, monkeypatch):
     forces = {0.3: 1.0, 0.85: 3.0}
     monkeypatch.setattr(GraspConfig, "evaluate", lambda self, robot, design: grasp_of(force=forces[self.friction]))
     grasps = [{"friction": friction} for friction in forces]
-    evaluator = Evaluator(finger, ["grip_force", "grip_energy"], sources={"grasps": grasps})
-    assert evaluator(finger.design_space.baseline) == {"grip_force": 2.0, "grip_energy": 1.0}
+    evaluator = StateEvaluator(finger, ["grip_force", "grip_energy"], sources={"grasps": grasps})
+    assert evaluator.measure(finger.design_space.baseline) == {"grip_force": 2.0, "grip_energy": 1.0}
 
 
 def test_what_cannot_grasp_is_refused(finger):
     with pytest.raises(ConfigError, match=r"'grip_force' needs robot 'contact_aided_finger', got 'finger'"):
-        Evaluator(make_robot("finger"), ["grip_force"])
+        StateEvaluator(make_robot("finger"), ["grip_force"])
     with pytest.raises(ConfigError, match=r"'grip_energy' needs backend 'fem', got 'surrogate'"):
-        Evaluator(finger, ["grip_energy"], backend="surrogate")
+        StateEvaluator(finger, ["grip_energy"], backend="surrogate")
 
 
 @pytest.mark.parametrize("name", ["front", "robust"])

@@ -10,7 +10,7 @@ import yaml
 from softgym_envs.errors import ConfigError, DataError, DesignError
 from softgym_envs.extensions.leaderboard import Search, load_problem, problem_names
 from softgym_envs.extensions.leaderboard.frozen import freeze, load_definition
-from softgym_envs.extensions.leaderboard.problem import GOAL_SETS, TRACKS, Score, goal_key
+from softgym_envs.extensions.leaderboard.problem import GOAL_SETS, TRACKS, JudgedScore, goal_key
 from softgym_envs.extensions.leaderboard.search import METHODS, BudgetSpent, make_optimiser, solve
 from tests.extensions.leaderboard.conftest import tiny_definition
 
@@ -134,9 +134,9 @@ def test_points_of_the_unit_box(tiny):
 
 def test_a_limit_of_bodies_counts_shares():
     search = Search(load_problem("finger-zone-v1"), limit=2)
-    search.ledger = [Score({}, "qp"), *(Score({}, "qp", share=0.25) for _ in range(3))]
+    search.ledger = [JudgedScore("qp"), *(JudgedScore("qp", share=0.25) for _ in range(3))]
     assert search.open
-    search.ledger.append(Score({}, "qp", share=0.25))
+    search.ledger.append(JudgedScore("qp", share=0.25))
     assert not search.open
 
 
@@ -146,7 +146,7 @@ def test_halving_scores_only_promising_bodies_on_all_goals(method):
     optimiser, told = make_optimiser(method, problem, 0), []
     for _ in range(300):  # one of the brackets of Hyperband stops no body after the first score
         share, design = optimiser.share, dict(optimiser.ask())
-        told.append(Score(design, "qp", share, scores=[-design["length"]]))
+        told.append(JudgedScore("qp", share, design=design, scores=[-design["length"]]))
         optimiser.tell(told[-1])
     shares = [row.share for row in told]
     assert shares.count(0.25) > shares.count(0.5) > shares.count(1.0) >= 1
@@ -169,7 +169,7 @@ def test_methods_of_other_packages_find_a_better_body_than_the_baseline(method):
         assert np.abs(point).max() <= 1.0 + 1e-9
         infeasible = "none" if point[0] > 0.9 else None
         scores.append(-float(np.sum((point - 0.5) ** 2)))
-        optimiser.tell(Score(design, "qp", scores=[] if infeasible else scores[-1:], reason=infeasible))
+        optimiser.tell(JudgedScore("qp", design=design, scores=[] if infeasible else scores[-1:], reason=infeasible))
     assert max(scores) > -0.75  # that of the middle of the box
 
 

@@ -9,7 +9,7 @@ from softgym_envs.errors import DataError
 from softgym_envs.extensions.leaderboard import board, regret, runs
 from softgym_envs.extensions.leaderboard import table as table_module
 from softgym_envs.extensions.leaderboard.frozen import load_problem
-from softgym_envs.extensions.leaderboard.problem import Score
+from softgym_envs.extensions.leaderboard.problem import JudgedScore
 from softgym_envs.extensions.leaderboard.scoring import Reference, front, hypervolume, improvement, normalised
 from softgym_envs.extensions.leaderboard.search import make_optimiser, solve
 from softgym_envs.extensions.leaderboard.table import Table, TableSearch, tabulate
@@ -43,7 +43,8 @@ def test_normalised_scores():
 
 def test_front_leaves_out_what_is_dominated():
     rows = [
-        Score({"x": i}, "qp", scores=list(s)) for i, s in enumerate([(1.0, 0.0), (0.0, 1.0), (0.0, 0.5), (1.0, 0.0)])
+        JudgedScore("qp", design={"x": i}, scores=list(s))
+        for i, s in enumerate([(1.0, 0.0), (0.0, 1.0), (0.0, 0.5), (1.0, 0.0)])
     ]
     assert [row.design["x"] for row in front(rows)] == [0, 1]
 
