@@ -14,6 +14,8 @@ from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import ContactModel
 from softgym_envs.mechanics.constraints.cable import Cable
+from softgym_envs.mechanics.contact.contact import ContactMemory
+from softgym_envs.mechanics.contact.obstacles import MeshObstacle
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.beam_motion import BeamMotion
 from softgym_envs.mechanics.solvers.dynamics import Dynamics, Motion
@@ -108,8 +110,12 @@ class FEMBackend(Backend):
 
     @classmethod
     def batch_class(cls, robot: Robot, options: Mapping[str, object]) -> str | None:
-        if not robot.made_of_beams or robot.touches or options.get("scheme", "euler") != "euler":
+        if not robot.made_of_beams or robot.self_contact or options.get("scheme", "euler") != "euler":
             return None
+        if robot.may_touch and not options.get("dynamics", False):
+            return None
+        if any(isinstance(obstacle, MeshObstacle) or obstacle.frame is not None for obstacle in robot.obstacles):
+            return None  # compiled contact knows neither
         return "softgym_envs.backends.fem_batch:FEMBatch"
 
     @property
@@ -311,7 +317,13 @@ class FEMBackend(Backend):
         return (self._dynamics or self._statics).not_compiled
 
     def go_to(
-        self, x: np.ndarray, effort: np.ndarray, delta: np.ndarray, velocity: np.ndarray, command: np.ndarray
+        self,
+        x: np.ndarray,
+        effort: np.ndarray,
+        delta: np.ndarray,
+        velocity: np.ndarray,
+        command: np.ndarray,
+        memory: ContactMemory | None = None,
     ) -> None:
         """Go on from a state that another solver has found for the present body under commanded displacements.
 
@@ -321,11 +333,12 @@ class FEMBackend(Backend):
             delta: their values, shape (size,).
             velocity: of the nodes [m/s], shape (n, 3).
             command: displacements that led there, shape (n_a,).
+            memory: what friction remembers there; None for a body that touches nothing.
         """
         count, e = len(command), self.state.condensed.slices["e"]
-        self._statics.restore(x, effort)
+        self._statics.restore(x, effort, memory=memory)
         if self._dynamics is not None:
-            self._dynamics.restore(x, effort, velocity)
+            self._dynamics.restore(x, effort, velocity, memory=memory)
         self._mode = "displacement"
         self.state = replace(
             self._rest,
@@ -335,6 +348,7 @@ class FEMBackend(Backend):
             row_effort=effort.copy(),
             effector=delta[e].reshape(-1, 3).copy(),
             nodes=x.copy(),
+            memory=memory,
         )
 
     def _extra_state(self) -> tuple[str, tuple | None, PointForce | None]:

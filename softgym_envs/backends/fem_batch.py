@@ -12,9 +12,11 @@ from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 from softgym_envs.mechanics.condensation import CondensedModel
+from softgym_envs.mechanics.contact.contact import ContactMemory
 from softgym_envs.mechanics.elements.beams import are_folded
 from softgym_envs.mechanics.solvers.beam_batch import BeamBatch, BeamStates
-from softgym_envs.mechanics.solvers.beam_motion import BeamMotion
+from softgym_envs.mechanics.solvers.beam_contact import ContactPoints
+from softgym_envs.mechanics.solvers.beam_motion import BeamMotion, anchors_of, memory_of
 from softgym_envs.mechanics.solvers.equilibrium import RowLayout
 from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.domain import FOLDED
@@ -27,7 +29,7 @@ class FEMBatch(BatchBackend):
     row by row.
 
     Args:
-        robot: a robot with ``made_of_beams`` that touches nothing.
+        robot: a robot with ``made_of_beams``; one that touches something can only move in time.
         designs: bodies, shape (B, number of design variables).
         **options: those of `FEMBackend`.
 
@@ -108,7 +110,10 @@ class FEMBatch(BatchBackend):
         self.command[index] = 0.0
         self._converged[index] = True
         for i in index.tolist():
-            x, effort, delta, compliance = _rest(self._owners[self._designs[i]])
+            owner = self._owners[self._designs[i]]
+            x, effort, delta, compliance = _rest(owner)
+            if self._present.anchors is not None:
+                self._present.anchors[i] = anchors_of(self._points(i), _memory(owner))
             for states in (self._present, self._balanced):
                 states.x[i], states.effort[i], states.delta[i], states.compliance[i] = x, effort, delta, compliance
                 states.velocity[i] = 0.0
@@ -148,15 +153,27 @@ class FEMBatch(BatchBackend):
         targets[:, :, : commands.shape[2]] = commands
         return targets
 
+    def _points(self, i: int) -> ContactPoints:
+        """Return the points of a row's body that may touch something."""
+        contact = _beams(self._owners[self._designs[i]]).body.contact
+        assert contact is not None
+        return contact
+
     def _step_alone(self, i: int, command: np.ndarray) -> bool:
         """Step one row with the general solver; whether that finds the state."""
         owner, present = self._owners[self._designs[i]], self._present
-        owner.go_to(present.x[i], present.effort[i], present.delta[i], present.velocity[i], self.command[i])
+        memory = None
+        if present.anchors is not None:
+            memory = memory_of(self._points(i), present.anchors[i], _memory(owner))
+        now = present.x[i], present.effort[i], present.delta[i], present.velocity[i]
+        owner.go_to(*now, self.command[i], memory)
         try:
             state = owner.step(command)
         except ConvergenceError:
             return False
         assert state.nodes is not None
+        if present.anchors is not None:
+            present.anchors[i] = anchors_of(self._points(i), _memory(owner))
         present.x[i], present.effort[i] = state.nodes, state.condensed.effort
         present.velocity[i] = 0.0 if state.motion is None else state.motion.velocity
         present.delta[i], present.compliance[i] = state.condensed.delta.array, state.condensed.compliance
@@ -213,7 +230,8 @@ class FEMBatch(BatchBackend):
         return CondensedModel(present.compliance.copy(), free, present.effort.copy(), like.roles, like.rows)
 
     def settled(self) -> BatchState:
-        if self.moving:
+        # A body in contact may have no equilibrium, or one that depends on how it got there.
+        if self.moving and self._present.anchors is None:
             # From the equilibria under the last commands, or from the present shapes where these were not found.
             states = self._balanced
             for name in ("x", "effort"):
@@ -234,6 +252,8 @@ class FEMBatch(BatchBackend):
         return self.state
 
     def gradient(self, effector: np.ndarray, effort: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if self._present.anchors is not None:
+            raise ValueError(f"robot '{self.robot.name}' touches obstacles: its equilibria have no gradient")
         states, a, e = self._balanced, self._slices["a"], self._slices["e"]
         follows = np.abs(states.delta[:, a] - self.command) < 1e-6 * self.robot.rates
         return condensed_gradient(states.compliance, a, e, follows, effector, effort)
@@ -247,7 +267,7 @@ def _beams(owner: FEMBackend) -> BeamMotion:
     """
     found = owner.beams
     if found is None:
-        raise ValueError(f"bodies of robot '{owner.robot.name}' cannot be stepped together: they are not beams alone")
+        raise ValueError(f"bodies of robot '{owner.robot.name}' cannot be stepped together: {owner.not_compiled}")
     return found
 
 
@@ -256,3 +276,10 @@ def _rest(owner: FEMBackend) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nda
     state = owner.reset()
     assert state.nodes is not None
     return state.nodes, state.condensed.effort, state.condensed.delta.array, state.condensed.compliance
+
+
+def _memory(owner: FEMBackend) -> ContactMemory:
+    """Return what friction remembers at the present state of a body."""
+    memory = owner.state.memory
+    assert isinstance(memory, ContactMemory)
+    return memory

@@ -1,5 +1,6 @@
 """Finite elements of many bodies of beams at once, against single environments."""
 
+import pickle
 from dataclasses import replace
 
 import gymnasium
@@ -19,6 +20,8 @@ from softgym_envs.surrogate.domain import FOLDED
 
 TETRAPOD, TRUNK = "SoftGym/TetrapodReach-v0", "SoftGym/TrunkReach-v0"
 STEPS = 6
+TABLE = {"obstacles": [{"kind": "plane", "point": [0.0, 0.0, -0.157], "normal": [0.0, 0.05, 1.0], "friction": 0.5}]}
+"""A slope below the centre, which touches it as it moves."""
 
 
 class WeakTetrapod(Tetrapod):
@@ -71,8 +74,9 @@ def compare_with_singles(identifier, options, designs):
             [{}, {"leg_length": 0.2}],
         ),
         (TRUNK, {}, [{}, {"module_length": 0.056}]),
+        (TETRAPOD, {"robot_options": {"elements": 2, **TABLE}}, [{}, {"leg_length": 0.2}]),
     ],
-    ids=["payload and designs", "statics", "chambers"],
+    ids=["payload and designs", "statics", "chambers", "contact"],
 )
 def test_rows_step_as_single_environments(identifier, options, designs):
     assert compare_with_singles(identifier, options, designs) < 0.999
@@ -132,6 +136,40 @@ def test_rows_with_folded_legs_are_not_trusted():
         info = env.step(right)[4]
     np.testing.assert_array_equal(info["trusted"], [False, True])
     np.testing.assert_array_equal(info["distrust"], [FOLDED, 0])
+
+
+def test_rows_in_contact_are_single_bodies_to_the_last_bit():
+    """With friction, after a reset of one row, and in copies."""
+    robot, names = Tetrapod(elements=2, **TABLE), Tetrapod(elements=2).design_space.names
+    bodies = np.array([robot.design_space.baseline.array, robot.design_space.complete({"leg_length": 0.2}).array])
+    batch = FEMBatch(robot, bodies, dynamics=True)
+    singles = [FEMBackend(robot, dict(zip(names, body, strict=True)), dynamics=True) for body in bodies]
+    commands = np.random.default_rng(0).uniform(-0.6, -0.2, (8, 2, 4))
+    touching = sliding = 0
+
+    def compare(rows, command):
+        nonlocal touching, sliding
+        rows.step(command)
+        assert rows.state.converged.all()
+        for i, single in enumerate(singles):
+            state = single.step(command[i])
+            np.testing.assert_array_equal(rows.state.effector[i], state.effector.ravel())
+            np.testing.assert_array_equal(rows.condensed.compliance[i], state.condensed.compliance)
+            touching += state.contacts.count
+            sliding += int(state.contacts.sliding.sum())
+
+    for command in commands[:5]:
+        compare(batch, command)
+    assert touching > 10 and sliding > 0
+    batch.rest(np.array([1]))
+    singles[1].reset()
+    copied = pickle.loads(pickle.dumps(batch))
+    for command in commands[5:]:
+        compare(batch, command)
+        copied.step(command)
+        np.testing.assert_array_equal(copied.state.effector, batch.state.effector)
+    with pytest.raises(ValueError, match="robot 'tetrapod' touches obstacles: its equilibria have no gradient"):
+        batch.gradient(np.zeros((2, 3)), np.zeros((2, 4)))
 
 
 def test_tasks_that_push_step_in_processes():
