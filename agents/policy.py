@@ -219,7 +219,8 @@ def _meaning(environment: EnvironmentConfig, any_task: bool) -> dict[str, tuple[
     variables = [robot.design_space[name] for name in shown]
     task = environment.make_task(robot)
     # Goals of other tasks are read alike if they have the same unit and scales.
-    kind: object = (task.goal_unit, task.sensors, task.hides_effector, task.goal_scale, task.error_scale)
+    sensors = None if task.sensors is None else task.sensors.count
+    kind: object = (task.distance_scale.goal_unit, sensors, task.goal_scale, task.error_scale)
     lookahead = 0 if any_task else task.lookahead
     scales = (
         [(actuator.name, actuator.low, actuator.high, actuator.rate) for actuator in robot.actuators],

@@ -212,7 +212,7 @@ def summary(runs: list[StoredRuns]) -> list[Summary]:
     """Return the numbers of `table` in SI units: a row for each environment, backend and agent."""
     rows = []
     for entry in runs:
-        metres = entry.environment.task_class.goal_unit == "m"
+        metres = entry.environment.task_class.distance_scale.goal_unit == "m"
         quantity = ("tracking_distance" if entry.follows else "distance") if metres else "relative_error"
         for backend in sorted({entry.environment.backend, "fem"}):
             for agent in agent_titles():

@@ -186,8 +186,9 @@ class StudyConfig(StudyProblem):
         backend = {**environment.on("fem").backend_options, **self.finalists.fem_options}
         for what, value in (("environment.plant", environment.plant), ("options of the FEM backend", backend)):
             refuse(bool(value), f"{ends} solves for equilibria without {what}, got {value}{allowed}")
+        load = environment.make_task(robot).load
         refuse(
-            environment.make_task(robot).touches,
+            load is not None and load.on_body,
             f"{ends} does not know what touches the body in task '{row.task}'{allowed}",
         )
         for name, metric in self.objectives.items():

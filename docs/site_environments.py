@@ -53,10 +53,15 @@ def environment_sections(identifier: str) -> dict[str, Callable[[], str]]:
     task: Task = task_class(robot, **row.task_options)
     moving = bool(row.backend_options.get("dynamics"))
     spaces = AgentSpaces(
-        robot, action_mode="increment", design_names=(), axes=task.axes, moving=moving, sensors=task.sensors
+        robot,
+        action_mode="increment",
+        design_names=(),
+        axes=task.axes,
+        moving=moving,
+        sensors=task.sensors.count if task.sensors else 0,
     )
     scales = observation_scales(robot) | {"position": task.goal_scale, "error": task.error_scale}
-    goal_unit = task.goal_unit
+    goal_unit = task.distance_scale.goal_unit
     forces = goal_unit == "N"
     along = "" if task.axes.all() else " along " + " and ".join(np.array(list("xyz"))[task.axes > 0.0])
     unit = robot.actuators[0].unit

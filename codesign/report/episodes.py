@@ -54,12 +54,12 @@ class Episode:
     @property
     def has_places(self) -> bool:
         """Whether goals are positions that a picture can show."""
-        return self.task.goal_unit == "m"
+        return self.task.distance_scale.goal_unit == "m"
 
     @property
     def goal_text(self) -> str:
         """The last goal, as people read it: ``"(0.0, 30.0, -80.0) mm"``."""
-        unit, factor, _ = display(self.task.goal_unit)
+        unit, factor, _ = display(self.task.distance_scale.goal_unit)
         return f"({', '.join(f'{factor * value:.{1 if factor > 1.0 else 2}f}' for value in self.path[-1])}) {unit}"
 
     def distance_text(self, index: int) -> str:

@@ -72,7 +72,7 @@ def goal_outcomes(snapshot: StudySnapshot, results: StudyResults) -> GoalOutcome
     rows = [row for row in results.comparison if row.backend == "fem"]
     if not rows or results.baseline is None or results.winner is None:
         return None
-    if snapshot.config.environment.task_class.goal_unit != "m":
+    if snapshot.config.environment.task_class.distance_scale.goal_unit != "m":
         return None
     tests = {group.key: group for group in snapshot.unseen_tests}
     found = [tests[body.trial, rows[0].agent, "fem"] for body in (results.baseline, results.winner)]

@@ -111,8 +111,9 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         """What the sensors show of the present state."""
         if (shown := self._episodes.shown_rows(0)) is not None:
             return shown
-        state = self.state
-        return Sensed(state.displacement, state.effort, self.task.measure(state), self.task.sensor_readings(state))
+        state, sensors = self.state, self.task.sensors
+        readings = np.zeros(0) if sensors is None else sensors.readings(state)
+        return Sensed(state.displacement, state.effort, self.task.measure(state), readings)
 
     @property
     def goal(self) -> np.ndarray:

@@ -94,7 +94,9 @@ class Episodes:
         self.designs = np.tile(self.fixed.array, (count, 1))
         self.backend = setup.make_backend(count, alone=alone)
         task = self.task
-        if (task.pushes and not self.backend.takes_force) or (task.touches and not self.backend.takes_touch):
+        if (load := task.load) is not None and not (
+            self.backend.takes_touch if load.on_body else self.backend.takes_force
+        ):
             raise ValueError(
                 f"task '{task.name}' pushes the robot, but backend '{setup.backend}' takes no forces; allowed: 'fem'"
             )
@@ -102,7 +104,8 @@ class Episodes:
         self._reads_states = bool(task_by_row(task))
         # What a task remembers of an episode is in the task itself.
         self._remembers = self._reads_states or type(task).begin is not Task.begin
-        self._tasks = [task, *(copy.copy(task) for _ in range(count - 1))] if self._remembers else [task] * count
+        copies = [copy.deepcopy(task, {id(self.robot): self.robot}) for _ in range((count - 1) * self._remembers)]
+        self._tasks = [task, *copies] if self._remembers else [task] * count
         self.spaces = setup.spaces(moving=self.backend.moving)
         self.unit_designs = self._space.observe(self.designs, self.spaces.design_names)
         self.generators: list[np.random.Generator | None] = [None] * count
@@ -188,7 +191,12 @@ class Episodes:
         self.counts[index] = paths.shape[1]
         if self._remembers:
             for i in index.tolist():
-                self._tasks[i].begin(self._generator(i))
+                own, random = self._tasks[i], self._generator(i)
+                own.begin(random)
+                if own.load is not None:
+                    own.load.begin(random)
+                if own.sensors is not None:
+                    own.sensors.begin()
 
     def _begin_bodies(self, index: np.ndarray, designs: np.ndarray) -> dict[int, InfeasibleDesign]:
         """Give some rows bodies; those that cannot exist are left as they were and returned."""
@@ -272,13 +280,14 @@ class Episodes:
         if self._inexact.any():
             gain, offset, backlash = self._drives.values()
             arriving = play(gain * arriving + offset, self.backend.command, backlash)
-        rows = range(len(self._tasks))
-        if self.task.touches:
-            loads = [self._tasks[i].touch(int(self.steps[i])) for i in rows]
-            self.backend.touch([self.plant[i].equivalent_model_force(load) for i, load in enumerate(loads)])
-        if self.task.pushes:
-            pushes = [self._tasks[i].push(int(self.steps[i])) for i in rows]
-            self.backend.push([None if f is None else f / self.stiffness[i] for i, f in enumerate(pushes)])
+        if self.task.load is not None:
+            loads = [
+                None if task.load is None else task.load.at(int(self.steps[i])) for i, task in enumerate(self._tasks)
+            ]
+            if self.task.load.on_body:
+                self.backend.touch([self.plant[i].equivalent_model_force(load) for i, load in enumerate(loads)])
+            else:
+                self.backend.push([None if f is None else f / self.stiffness[i] for i, f in enumerate(loads)])
         self.backend.step(arriving)
         self.steps += 1
 
@@ -322,8 +331,10 @@ class Episodes:
         if self.plants is not None:
             for field in fields(Plant):
                 info[f"plant_{field.name}"] = np.array([getattr(plant, field.name) for plant in self.plant])[only]
-        sensors = np.stack([task.sensor_readings(one) for one in states])[only] if task.sensors else measured[..., :0]
-        shown = self._read(Sensed(state.displacement, state.effort, measured, sensors), index)
+        readings = measured[..., :0]
+        if task.sensors is not None:
+            readings = np.stack([task.sensors.readings(one) for one in states])[only]
+        shown = self._read(Sensed(state.displacement, state.effort, measured, readings), index)
         velocity = self.backend.velocity
         observation = self.spaces.observe(
             self.command[only],
@@ -333,7 +344,7 @@ class Episodes:
             self.goals(task.lookahead)[only] if task.lookahead else goals,
             self.unit_designs[only],
             None if velocity is None else velocity[only],
-            self._sensor_values(squash(shown.sensors), index) if task.sensors else None,
+            None if task.sensors is None else self._sensor_values(squash(shown.sensors), index),
         )
         return observation, np.where(state.converged, reward, 0.0), info
 
@@ -376,14 +387,14 @@ class Episodes:
         return self.shown_rows(self._only) or true
 
     def _sensor_values(self, readings: np.ndarray, index: np.ndarray | None) -> np.ndarray:
-        """Return the sensor values of observations for readings in [-1, 1] (B, s): these, touch, earlier readings."""
+        """Return the sensor values of observations for readings in [-1, 1] (B, s): these and further ones."""
         readings = readings.reshape(len(self._tasks), -1)
         commands = (self.command - self.spaces.middle) / self.spaces.half_range
         both = np.concatenate([commands, readings], axis=1)
         values = []
         for i, task in enumerate(self._tasks):
-            new = index is None or i in index
-            values.append(np.concatenate([readings[i], task.touch_readings(), task.past_readings(both[i], new)]))
+            assert task.sensors is not None
+            values.append(np.concatenate([readings[i], task.sensors.further(both[i], index is None or i in index)]))
         return np.stack(values)[self._only]
 
     def shown_rows(self, rows: int | slice) -> Sensed | None:

@@ -31,7 +31,7 @@ class GoalObservation(gymnasium.Wrapper):
         inner: Any = env.unwrapped
         self._task, self._spaces = inner.task, inner.spaces
         task = self._task
-        if task.horizon != 1 or task.needs_state or task.pushes or task.touches or task.sensors:
+        if task.horizon != 1 or task.needs_state or task.load or task.sensors:
             raise ValueError(
                 f"task '{self._task.name}' has no goal-conditioned interface: its goal moves, or it rates more than "
                 "the goal and the effector; allowed: tasks such as 'reach'"

@@ -143,7 +143,7 @@ class Setup:
             moving=moving,
             goal_scale=self.task.goal_scale,
             error_scale=self.task.error_scale,
-            sensors=self.task.sensors,
+            sensors=0 if self.task.sensors is None else self.task.sensors.count,
         )
 
 
@@ -344,8 +344,8 @@ def check_counts(num_envs: int, max_episode_steps: int | None) -> None:
 
 def task_by_row(task: Task) -> str:
     """Return what a task does with single bodies rather than with arrays of many, for a message; empty for nothing."""
-    if task.pushes or task.touches:
+    if task.load is not None:
         return "pushes the robot"
-    if task.sensors:
+    if task.sensors is not None:
         return "shows sensors"
     return "reads whole mechanical states" if task.needs_state else ""

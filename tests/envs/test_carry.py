@@ -48,12 +48,12 @@ def test_pushes(robot):
     rng = np.random.default_rng(0)
     firsts, forces = set(), []
     for _ in range(200):
-        task.begin(rng)
-        steps = [k for k in range(20) if task.push(k) is not None]
+        task.load.begin(rng)
+        steps = [k for k in range(20) if task.load.at(k) is not None]
         assert steps == list(range(steps[0], steps[0] + 3))
         firsts.add(steps[0])
-        forces.append(task.push(steps[0]))
-        assert (task.push(steps[2]) == forces[-1]).all()
+        forces.append(task.load.at(steps[0]))
+        assert (task.load.at(steps[2]) == forces[-1]).all()
     assert firsts == set(range(10))
     sizes = np.linalg.norm(forces, axis=1)
     assert sizes.max() <= 0.5 and sizes.max() > 0.45 and sizes.min() < 0.05
@@ -62,8 +62,7 @@ def test_pushes(robot):
 
 def test_no_push_by_default(robot):
     task = make_task("carry", robot)
-    task.begin(np.random.default_rng(0))
-    assert all(task.push(k) is None for k in range(100))
+    assert task.load is None
 
 
 def test_pushes_move_the_robot_and_depend_on_the_seed():

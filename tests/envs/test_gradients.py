@@ -13,7 +13,7 @@ from softgym_envs.envs.tasks.registry import TASKS
 IDS = [
     name
     for name, row in ENVIRONMENTS.items()
-    if row.backend == "surrogate" and not TASKS.class_of(row.task).needs_state and not TASKS.class_of(row.task).pushes
+    if row.backend == "surrogate" and not TASKS.class_of(row.task).needs_state
 ]
 
 

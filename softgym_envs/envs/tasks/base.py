@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from softgym_envs.backends.backend import PointForce, State
+from softgym_envs.backends.backend import State
 from softgym_envs.envs.arrays import Array, namespace, pick_rows
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.quantities import check_quantity
@@ -47,11 +47,13 @@ class DistanceScale:
         name: what a distance is called: ``"distance"`` or ``"error"``.
         unit: unit that people read.
         factor: factor to that unit from what `Task.distance` returns.
+        goal_unit: unit of goals; those in metres are places, which pictures show.
     """
 
     name: str
     unit: str
     factor: float
+    goal_unit: str = "m"
 
     def text(self, distance: float, digits: int = 1) -> str:
         """Return a distance with its unit: ``"3.2 mm"``, or two significant digits if it is small: ``"0.028 mm"``."""
@@ -63,7 +65,7 @@ class DistanceScale:
 
 
 LENGTHS = DistanceScale("distance", "mm", 1e3)
-SHARES = DistanceScale("error", "%", 1e2)
+SHARES_OF_FORCES = DistanceScale("error", "%", 1e2, goal_unit="N")
 
 
 def tolerance(x: Array, margin: float) -> Array:
@@ -170,6 +172,54 @@ def check_force(value: float, name: str, robot: Robot) -> float:
     return float(value)
 
 
+class Load(ABC):
+    """A force on the robot in some control steps of an episode. Not every backend supports it.
+
+    Attributes:
+        on_body: it acts on a point of the body, otherwise on the first effector.
+    """
+
+    on_body: bool = False
+
+    @abstractmethod
+    def begin(self, rng: np.random.Generator) -> None:
+        """Draw what is random in an episode."""
+
+    @abstractmethod
+    def at(self, step: int) -> Any:
+        """Return what acts during a control step, or None.
+
+        It is a force on the effector [N], shape (3,), or with ``on_body`` a `PointForce`.
+        """
+
+
+class Sensors(ABC):
+    """What observations show in place of displacements, efforts and the effector.
+
+    Attributes:
+        count: number of values.
+    """
+
+    count: int
+
+    @abstractmethod
+    def begin(self) -> None:
+        """Forget the last episode."""
+
+    @abstractmethod
+    def readings(self, state: State) -> np.ndarray:
+        """Return the readings of the sensors over their scale, without noise, shape (s,); s is at most ``count``."""
+
+    @abstractmethod
+    def further(self, readings: np.ndarray, new: bool) -> np.ndarray:
+        """Return the other values that observations show, in [-1, 1], shape (``count`` - s,).
+
+        Args:
+            readings: commands and readings as observed now, in [-1, 1], shape (n_a + s,).
+            new: whether these are new readings, and not the last ones again.
+        """
+
+
 #: Smallest reward whose logarithm is followed; below, gradients would be without bound.
 SMALLEST_REWARD = 1e-6
 
@@ -186,8 +236,15 @@ class Task(ABC):
         horizon: control steps that a path of goals covers; afterwards the last goal holds. 1 for a single goal.
         max_episode_steps: time limit of an episode if none is given.
         lookahead: control steps by which the observed goal is ahead of the rated one.
+        load: what disturbs the robot in an episode; None for nothing.
+        sensors: what observations show in place of displacements, efforts and the effector; None if they show these.
+        agents: agents without training that the task is compared with.
+        qp_agent: the agent that ``"qp"`` stands for; another one where an inverse QP on the effector cannot follow the
+            goals.
+        distance_scale: how people read distances, and the unit of goals.
+        needs_state: whether the task reads whole mechanical states, one after the other, since it has methods of its
+            own that take one: `measure`, `state_terms` or `is_failed`.
         robot: the robot.
-        sensors: number of sensor values in observations of a task that hides the effector, else 0.
         axes: coordinates of the effector that count, 1 or 0, shape (3,).
         success_distance: distance below which a goal counts as reached [m].
         goal_scale: unit of goals and of what is compared with them in observations [m].
@@ -195,28 +252,21 @@ class Task(ABC):
         measured_scale: unit of the noise of what is compared with goals [m]: the robot's size.
     """
 
-    #: Whether the task applies forces to the effector, which not every backend supports.
-    pushes = False
-    #: Whether the task touches the body, which not every backend supports.
-    touches = False
-    #: Whether observations show sensors in place of displacements, efforts and the effector.
-    hides_effector = False
-    #: Whether the task reads whole mechanical states, which batched environments do not have.
-    needs_state = False
-    #: Agents without training that the task is compared with.
-    agents: tuple[str, ...] = ("qp", "qp_model", "qp_pi", "random")
-    #: The agent that ``"qp"`` stands for; another one where an inverse QP on the effector cannot follow the goals.
-    qp_agent = "qp"
-    #: Unit of goals; that of positions by default.
-    goal_unit = "m"
-    #: How people read distances; lengths by default.
-    distance_scale = LENGTHS
-
     name: str
     horizon: int = 1
     max_episode_steps: int = 100
     lookahead: int = 0
-    sensors: int = 0
+    load: Load | None = None
+    sensors: Sensors | None = None
+    agents: tuple[str, ...] = ("qp", "qp_model", "qp_pi", "random")
+    qp_agent: str = "qp"
+    distance_scale: DistanceScale = LENGTHS
+    needs_state: bool = False
+
+    def __init_subclass__(cls, **options: object) -> None:
+        super().__init_subclass__(**options)
+        of_states = ("measure", "state_terms", "is_failed")
+        cls.needs_state = any(getattr(cls, name) is not getattr(Task, name) for name in of_states)
 
     def __init__(self, robot: Robot) -> None:
         if not hasattr(self, "name"):
@@ -267,31 +317,6 @@ class Task(ABC):
     def begin(self, rng: np.random.Generator) -> None:  # noqa: B027 - optional
         """Draw whatever else is random in an episode of a single environment; nothing by default."""
 
-    def push(self, step: int) -> np.ndarray | None:
-        """Return the force on the first effector during a control step [N], shape (3,), or None."""
-        return None
-
-    def touch(self, step: int) -> PointForce | None:
-        """Return the force that touches the body during a control step, or None."""
-        return None
-
-    def sensor_readings(self, state: State) -> np.ndarray:
-        """Return the readings of the sensors over their scale, without noise, shape (s,); s is at most ``sensors``."""
-        return np.zeros(0)
-
-    def touch_readings(self) -> np.ndarray:
-        """Return what the touch sensors show of the last `touch`, in [-1, 1], shape (t,)."""
-        return np.zeros(0)
-
-    def past_readings(self, reading: np.ndarray, new: bool) -> np.ndarray:
-        """Return earlier readings that observations show besides the present one, shape (``sensors`` - s - t,).
-
-        Args:
-            reading: commands and sensors as observed now, in [-1, 1], shape (n_a + s,).
-            new: whether this is a new reading, and not the last one again.
-        """
-        return np.zeros(0)
-
     def measure(self, state: State) -> np.ndarray:
         """Return what is compared with the goal, shape (3,): the first effector [m] unless a task overrides it."""
         return state.effector[0]
@@ -301,23 +326,13 @@ class Task(ABC):
 
         Goals that are not places are drawn where the effector is.
         """
-        if self.goal_unit == "m":
+        if self.distance_scale.goal_unit == "m":
             return path, goal
         return state.effector[:1], state.effector[0]
 
     def hindsight_goals(self, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the goals (B, 3) that measured values (B, 3) would have reached, and which may be goals (B,)."""
         return measured, np.ones(len(measured), dtype=bool)
-
-    def contact_forces(self, state: State) -> np.ndarray:
-        """Return the force of each obstacle on the robot [N], shape (o, 3).
-
-        Raises:
-            ValueError: for a robot that touches nothing.
-        """
-        if state.contacts is None:
-            raise ValueError(f"task '{self.name}' needs contacts, but robot '{self.robot.name}' touches nothing")
-        return state.contacts.total
 
     def is_failed(self, state: State) -> bool:
         """Whether the goal can no longer be reached, which terminates the episode; never by default."""

@@ -8,8 +8,30 @@ from operator import mul
 import numpy as np
 
 from softgym_envs.envs.arrays import Array, namespace
-from softgym_envs.envs.tasks.base import Kinematics, Random, Task, check_force, check_length
+from softgym_envs.envs.tasks.base import Kinematics, Load, Random, Task, check_force, check_length
 from softgym_envs.robots.base import Robot
+
+
+class RandomPush(Load):
+    """A push on the effector in a random direction.
+
+    Args:
+        largest: largest force [N]; each is drawn uniformly.
+        steps: control steps that it lasts.
+        window: it begins at a random step among this many first control steps.
+    """
+
+    def __init__(self, largest: float, steps: int, window: int) -> None:
+        self.largest, self.steps, self.window = largest, steps, window
+        self._force, self._first = np.zeros(3), 0
+
+    def begin(self, rng: np.random.Generator) -> None:
+        direction = rng.standard_normal(3)
+        self._force = rng.uniform(0.0, self.largest) * direction / np.linalg.norm(direction)
+        self._first = int(rng.integers(self.window))
+
+    def at(self, step: int) -> np.ndarray | None:
+        return self._force if self._first <= step < self._first + self.steps else None
 
 
 class Carry(Task):
@@ -47,24 +69,10 @@ class Carry(Task):
             raise ValueError(f"push_steps = {push_steps} and push_window = {push_window} must be at least 1")
         self.axes = np.array([1.0, 0.0, 0.0])
         self.goal: Array = robot.effector_rest + np.array([distance, 0.0, 0.0])
-        self.largest_push, self.push_steps, self.push_window = push, push_steps, push_window
-        self.pushes = push > 0.0
-        self._force = np.zeros(3)
-        self._first = 0
+        self.load = RandomPush(push, push_steps, push_window) if push > 0.0 else None
 
     def sample(self, rng: Random, count: int, kinematics: Kinematics) -> Array:
         return namespace(self.goal).tile(self.goal, (count, 1, 1))
-
-    def begin(self, rng: np.random.Generator) -> None:
-        if self.largest_push:
-            direction = rng.standard_normal(3)
-            self._force = rng.uniform(0.0, self.largest_push) * direction / np.linalg.norm(direction)
-            self._first = int(rng.integers(self.push_window))
-
-    def push(self, step: int) -> np.ndarray | None:
-        if self.largest_push and self._first <= step < self._first + self.push_steps:
-            return self._force
-        return None
 
     def distance(self, effector: Array, goal: Array) -> Array:
         return (goal[..., 0] - effector[..., 0]).clip(min=0.0)

@@ -9,11 +9,11 @@ import numpy as np
 
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.extensions.grasping.control.contact_qp import ContactQP, ForceGoal
-from softgym_envs.robots.base import Robot
+from softgym_envs.extensions.grasping.robots.lifting import Lifting, lifting_of
 
 
 class OpenLoopGrasp:
-    """Closes all servos at full rate to a share of their range; then the drive ``"lift"`` rises by the goal's height.
+    """Closes all servos at full rate to a share of their range; then hands that lift rise by the goal's height.
 
     Nothing is measured. Forces are whatever the angle gives.
 
@@ -30,9 +30,10 @@ class OpenLoopGrasp:
     def __call__(self, observation: Any, env: Any) -> np.ndarray:
         """Return the action in the state of ``env``, shape (n_a,)."""
         present, command = env.state.command, self._share * env.robot.upper
-        if _lifts(env.robot):
-            closed = (present[:-1] >= command[:-1] - 1e-9).all()
-            command[-1] = env.goal[2] - env.robot.effector_rest[2] if closed else present[-1]
+        if (lifting := lifting_of(env.robot)) is not None:
+            drive = lifting.drive
+            closed = (np.delete(present, drive) >= np.delete(command, drive) - 1e-9).all()
+            command[drive] = env.goal[2] - env.robot.effector_rest[2] if closed else present[drive]
         return _towards(env, command)
 
 
@@ -52,7 +53,8 @@ class ForceGrasp:
 
     def __call__(self, observation: Any, env: Any) -> np.ndarray:
         """Return the action in the state of ``env``, shape (n_a,)."""
-        return self._lift(env) if _lifts(env.robot) else self._press(env)
+        lifting = lifting_of(env.robot)
+        return self._press(env) if lifting is None else self._lift(env, lifting)
 
     def _press(self, env: Any) -> np.ndarray:
         present = env.state.command
@@ -73,19 +75,16 @@ class ForceGrasp:
             command = present
         return _towards(env, command)
 
-    def _lift(self, env: Any) -> np.ndarray:
-        state, command = env.state, env.state.command.copy()
-        weight = 9.81 * env.design["object_mass"]
+    def _lift(self, env: Any, lifting: Lifting) -> np.ndarray:
+        state, command, drive = env.state, env.state.command.copy(), lifting.drive
+        weight = 9.81 * env.design[lifting.mass]
         pressing = state.contacts.pressing[state.contacts.obstacle == 1].sum()
-        if pressing < self.margin * weight / env.design["friction"]:
-            command[:-1] = env.robot.upper[:-1]
+        if pressing < self.margin * weight / env.design[lifting.friction]:
+            closing = np.arange(len(command)) != drive
+            command[closing] = env.robot.upper[closing]
         else:
-            command[-1] += env.goal[2] - state.effector[0, 2]
+            command[drive] += env.goal[2] - state.effector[0, 2]
         return _towards(env, command)
-
-
-def _lifts(robot: Robot) -> bool:
-    return robot.actuators[-1].name == "lift"
 
 
 def _towards(env: Any, command: np.ndarray) -> np.ndarray:

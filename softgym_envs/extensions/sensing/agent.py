@@ -43,7 +43,8 @@ class EstimatedQPAgent(InverseQPAgent):
 
     def _solve(self, env: Any, controller: InverseQP, present: np.ndarray) -> np.ndarray:
         estimator, task = self._estimators[env], env.task
-        load = None if task.touched is None else Touch(task.grid, task.touched, task.largest_force)
+        touch = task.touch
+        load = None if touch.cell is None else Touch(touch.grid, touch.cell, touch.largest)
         if load != estimator.load:
             estimator.touch(load)
         found = estimator.update(estimator.reading(present, env.sensed.sensors * env.robot.sensing.scale))

@@ -5,10 +5,75 @@ from __future__ import annotations
 import numpy as np
 
 from softgym_envs.backends.backend import PointForce, State
-from softgym_envs.envs.tasks.base import check_force
+from softgym_envs.envs.tasks.base import Load, Sensors, check_force
 from softgym_envs.envs.tasks.reach import Reach
-from softgym_envs.extensions.sensing.loads import Cell, finger_grid
+from softgym_envs.extensions.sensing.loads import Cell, TouchGrid, finger_grid
 from softgym_envs.robots.base import Robot
+
+
+class RandomTouch(Load):
+    """A constant force at a random point of a grid, from a random step on.
+
+    Args:
+        grid: cells of the touch sensor.
+        largest: largest force [N]; each is drawn uniformly.
+        window: it begins at a random step among this many first control steps.
+
+    Attributes:
+        cell: the touched cell; None before the touch.
+    """
+
+    on_body = True
+
+    def __init__(self, grid: TouchGrid, largest: float, window: int) -> None:
+        self.grid, self.largest, self.window = grid, largest, window
+        self.cell: Cell | None = None
+        self._load, self._first = PointForce(np.zeros(3), np.zeros(3)), 0
+
+    def begin(self, rng: np.random.Generator) -> None:
+        grid, self.cell = self.grid, None
+        along, across = grid.pitch * np.array(grid.cells) * rng.random(2)
+        point = np.array(grid.corner) + along * np.array(grid.along) + across * np.array(grid.across)
+        force = rng.uniform(0.0, self.largest) * np.array(grid.normal)
+        self._load, self._first = PointForce(point, force), int(rng.integers(self.window))
+
+    def at(self, step: int) -> PointForce | None:
+        """Return the force during a control step, or None; ``cell`` becomes its cell."""
+        self.cell = None if step < self._first else self.grid.cell(self._load.point)
+        return None if self.cell is None else self._load
+
+
+class FingerSensors(Sensors):
+    """Cavities, then a grid of touch cells, then earlier readings of the cavities with their commands.
+
+    The grid shows whether a cell is touched (1 or -1), and its place along both axes (-1 to 1, or 0).
+
+    Args:
+        scale: of the changes of the cavities' volumes, or of their pressures, shape (s,).
+        actuators: number of commands.
+        touch: what touches the grid.
+        history: number of readings of the cavities, the present one included.
+    """
+
+    def __init__(self, scale: np.ndarray, actuators: int, touch: RandomTouch, history: int) -> None:
+        self.scale, self.touch, self.history = scale, touch, history
+        self.count = len(scale) + 3 + (history - 1) * (actuators + len(scale))
+        self._readings: list[np.ndarray] = []
+
+    def begin(self) -> None:
+        self._readings = []
+
+    def readings(self, state: State) -> np.ndarray:
+        return state.condensed.delta.s / self.scale
+
+    def further(self, readings: np.ndarray, new: bool) -> np.ndarray:
+        if new:
+            known = [readings, *self._readings]
+            self._readings = (known + self.history * known[-1:])[: self.history]
+        touched = np.array([-1.0, 0.0, 0.0])
+        if self.touch.cell is not None:
+            touched[:] = 1.0, *(2.0 * (np.array(self.touch.cell) + 0.5) / np.array(self.touch.grid.cells) - 1.0)
+        return np.concatenate([touched, *self._readings[1:]])
 
 
 class SensedReach(Reach):
@@ -28,7 +93,6 @@ class SensedReach(Reach):
     """
 
     name = "sensed_reach"
-    hides_effector = True
     agents = ("qp_model", "qp_estimated", "random")
 
     def __init__(
@@ -43,7 +107,7 @@ class SensedReach(Reach):
         **options: object,
     ) -> None:
         super().__init__(robot, command_low=command_low, **options)  # type: ignore[arg-type]
-        if not len(robot.sensing.scale):
+        if not robot.sensing:
             raise ValueError(f"task '{self.name}' needs a robot with sensors, but robot '{robot.name}' has none")
         if not (np.isfinite(force) and force >= 0.0):
             raise ValueError(f"force = {force} N must be non-negative and finite")
@@ -52,45 +116,7 @@ class SensedReach(Reach):
             raise ValueError(f"window = {window} must be at least 1")
         if history < 1:
             raise ValueError(f"history = {history} must be at least 1")
-        self.grid = finger_grid(pitch)
-        self.axes = np.abs(np.array(self.grid.normal))
-        self.largest_force, self.window = force, window
-        self.touches = force > 0.0
-        each = len(robot.actuators) + len(robot.sensing.scale)
-        self.history, self.sensors = history, len(robot.sensing.scale) + 3 + (history - 1) * each
-        self._readings: list[np.ndarray] = []
-        self.touched: Cell | None = None
-        self._load, self._first = PointForce(np.zeros(3), np.zeros(3)), 0
-
-    def begin(self, rng: np.random.Generator) -> None:
-        self.touched, self._readings = None, []
-        if self.touches:
-            along, across = self.grid.pitch * np.array(self.grid.cells) * rng.random(2)
-            point = np.array(self.grid.corner) + along * np.array(self.grid.along) + across * np.array(self.grid.across)
-            force = rng.uniform(0.0, self.largest_force) * np.array(self.grid.normal)
-            self._load, self._first = PointForce(point, force), int(rng.integers(self.window))
-
-    def touch(self, step: int) -> PointForce | None:
-        """Return the force that touches the body during a control step, or None; `touched` becomes its cell."""
-        if not self.touches or step < self._first:
-            self.touched = None
-            return None
-        self.touched = self.grid.cell(self._load.point)
-        return self._load
-
-    def sensor_readings(self, state: State) -> np.ndarray:
-        """Return the changes of the cavities' volumes, or their pressures, over their scale, shape (s,)."""
-        return state.condensed.delta.s / self.robot.sensing.scale
-
-    def touch_readings(self) -> np.ndarray:
-        """Return whether a cell is touched (1 or -1), and its place along both axes of the grid (-1 to 1, or 0)."""
-        if self.touched is None:
-            return np.array([-1.0, 0.0, 0.0])
-        return np.array([1.0, *(2.0 * (np.array(self.touched) + 0.5) / np.array(self.grid.cells) - 1.0)])
-
-    def past_readings(self, reading: np.ndarray, new: bool) -> np.ndarray:
-        """Return the commands and cavities of the readings before the present one, shape ((history - 1) (n_a + s),)."""
-        if new:
-            known = [reading, *self._readings]
-            self._readings = (known + self.history * known[-1:])[: self.history]
-        return np.concatenate([np.zeros(0), *self._readings[1:]])
+        self.touch = RandomTouch(finger_grid(pitch), force, window)
+        self.load = self.touch if force > 0.0 else None
+        self.sensors = FingerSensors(robot.sensing.scale, len(robot.actuators), self.touch, history)
+        self.axes = np.abs(np.array(self.touch.grid.normal))

@@ -51,8 +51,8 @@ def test_observations_hold_sensors_and_no_effector():
     change = env.unwrapped.state.condensed.delta.s / env.unwrapped.robot.sensing.scale
     np.testing.assert_allclose([first, second], change / (1.0 + np.abs(change)), rtol=1e-6)
     assert felt == 1.0
-    centres = task.grid.corners(task.touched).mean(axis=0)
-    width, length = task.grid.pitch * np.array(task.grid.cells)
+    centres = task.touch.grid.corners(task.touch.cell).mean(axis=0)
+    width, length = task.touch.grid.pitch * np.array(task.touch.grid.cells)
     np.testing.assert_allclose([across, along], [2 * centres[0] / width, 2 * (-0.015 - centres[2]) / length - 1])
     np.testing.assert_allclose(env.unwrapped.sensed.sensors, change)
     with pytest.raises(ValueError, match="sensors in place of its effector"):
@@ -82,7 +82,7 @@ def test_noise_reaches_the_volumes():
     errors = []
     for _ in range(100):
         env.step(np.zeros(1))
-        true = env.unwrapped.task.sensor_readings(env.unwrapped.state)
+        true = env.unwrapped.task.sensors.readings(env.unwrapped.state)
         errors.append(env.unwrapped.sensed.sensors - true)
     assert 0.008 < np.std(errors) < 0.012
 
@@ -93,9 +93,9 @@ def test_touches_begin_within_the_window_and_copies_go_on_with_them():
     for seed in range(4):
         env.reset(seed=seed)
         felt = []
-        for _ in range(env.task.window + 1):
+        for _ in range(env.task.touch.window + 1):
             env.step(np.array([0.5]))
-            felt.append(env.task.touched is not None)
+            felt.append(env.task.touch.cell is not None)
         assert felt[-1] and felt == sorted(felt)
         begins.add(felt.index(True))
     assert len(begins) > 1

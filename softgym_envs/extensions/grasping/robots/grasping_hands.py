@@ -17,6 +17,7 @@ from softgym_envs.errors import unknown_name
 from softgym_envs.extensions.grasping.grasps import KINDS, GraspObject
 from softgym_envs.extensions.grasping.robots.carried_objects import CARRIED, ROUNDING, Shape
 from softgym_envs.extensions.grasping.robots.contact_aided_finger import ContactAidedFinger
+from softgym_envs.extensions.grasping.robots.lifting import Lifting
 from softgym_envs.extensions.grasping.robots.slide import Slide
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
@@ -122,6 +123,7 @@ class ContactAidedGripper(Robot):
     rest_mode = "displacement"
     learning = Learning(convex=False)
     view = View(at_rest=True)
+    lifting = Lifting(drive=2, mass="object_mass", friction="friction")
     backends = {
         "surrogate": "softgym_envs.extensions.grasping.backends.chain_hand:ChainHandBackend",
         "hybrid": "softgym_envs.extensions.grasping.backends.hybrid_chain:HybridHandBackend",

@@ -6,8 +6,27 @@ import numpy as np
 
 from softgym_envs.backends.backend import State
 from softgym_envs.envs.arrays import Array
-from softgym_envs.envs.tasks.base import SHARES, Kinematics, Random, Task, check_force, check_length, tolerance
+from softgym_envs.envs.tasks.base import (
+    SHARES_OF_FORCES,
+    Kinematics,
+    Random,
+    Task,
+    check_force,
+    check_length,
+    tolerance,
+)
 from softgym_envs.robots.base import Robot
+
+
+def contact_forces(task: Task, state: State) -> np.ndarray:
+    """Return the force of each obstacle on the robot [N], shape (o, 3).
+
+    Raises:
+        ValueError: for a robot that touches nothing.
+    """
+    if state.contacts is None:
+        raise ValueError(f"task '{task.name}' needs contacts, but robot '{task.robot.name}' touches nothing")
+    return state.contacts.total
 
 
 class Grasp(Task):
@@ -32,11 +51,9 @@ class Grasp(Task):
 
     name = "grasp"
     max_episode_steps = 25
-    needs_state = True
     agents = ("close", "force", "random")
     qp_agent = "force"
-    goal_unit = "N"
-    distance_scale = SHARES
+    distance_scale = SHARES_OF_FORCES
 
     def __init__(
         self,
@@ -84,7 +101,7 @@ class Grasp(Task):
 
     def measure(self, state: State) -> np.ndarray:
         """Return the force of the robot on the object [N], shape (3,)."""
-        return -self.contact_forces(state)[0]
+        return -contact_forces(self, state)[0]
 
     def hindsight_goals(self, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         low, high = self.forces

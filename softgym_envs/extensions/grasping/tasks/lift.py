@@ -7,6 +7,8 @@ import numpy as np
 from softgym_envs.backends.backend import State
 from softgym_envs.envs.arrays import Array
 from softgym_envs.envs.tasks.base import Kinematics, Random, Task, check_length
+from softgym_envs.extensions.grasping.robots.lifting import lifting_of
+from softgym_envs.extensions.grasping.tasks.grasp import contact_forces
 from softgym_envs.robots.base import Robot
 
 
@@ -18,7 +20,7 @@ class Lift(Task):
     (dropped), or when the hand has risen by twice that height while the object is still there (left behind).
 
     Args:
-        robot: a robot whose last actuator is the drive ``"lift"``, with contacts ``"table"`` and then the object.
+        robot: a robot with a `Lifting`, with contacts ``"table"`` and then the object.
         heights: smallest and largest height of the goal above the object's place on the table [m]; episodes draw it
             uniformly.
         lost_height: [m].
@@ -26,7 +28,6 @@ class Lift(Task):
 
     name = "lift"
     max_episode_steps = 30
-    needs_state = True
     agents = ("close", "force", "random")
     qp_agent = "force"
 
@@ -34,8 +35,10 @@ class Lift(Task):
         self, robot: Robot, *, heights: tuple[float, float] = (0.005, 0.015), lost_height: float = 0.004
     ) -> None:
         super().__init__(robot)
-        if robot.actuators[-1].name != "lift":
-            raise ValueError(f"task 'lift' needs a robot whose last actuator is 'lift'; '{robot.name}' has none")
+        lifting = lifting_of(robot)
+        if lifting is None:
+            raise ValueError(f"task 'lift' needs a robot that lifts; robot '{robot.name}' does not")
+        self._lifting = lifting
         low, high = (check_length(height, "heights", robot) for height in heights)
         if not low <= high:
             raise ValueError(f"heights = {tuple(heights)} m must be in increasing order")
@@ -62,11 +65,11 @@ class Lift(Task):
         """Whether the object was dropped or left behind; states must come in the order of the episode."""
         height = float(state.effector[0, 2] - self.robot.effector_rest[2])
         self._raised |= height > self.lost_height
-        risen = self._raised or state.displacement[-1] > 2.0 * self.lost_height
+        risen = self._raised or state.displacement[self._lifting.drive] > 2.0 * self.lost_height
         return bool(risen and height < 0.25 * self.lost_height)
 
     def state_terms(self, state: State) -> dict[str, float]:
         """Return the factor of the reward for taking the weight off the table, in [0.8, 1]."""
-        table, held = self.contact_forces(state)[:2, 2] * [1.0, -1.0]
+        table, held = contact_forces(self, state)[:2, 2] * [1.0, -1.0]
         share = table / (table + max(held, 0.0)) if table > 0.0 else 0.0
         return {"hold": 1.0 - 0.2 * share}
