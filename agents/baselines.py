@@ -96,7 +96,8 @@ class ModelQPAgent(InverseQPAgent):
                 self._models[env] = SurrogateBackend(env.robot, env.design)
             except WeightsError:
                 # The plant itself, unless something touches it that the agent does not know.
-                self._models[env] = FEMBackend(env.robot, env.design) if env.task.touches else None
+                disturbed = env.task.load is not None and env.task.load.on_body
+                self._models[env] = FEMBackend(env.robot, env.design) if disturbed else None
         model = self._models[env]
         if model is not None:
             model.reset(env.design)

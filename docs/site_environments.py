@@ -58,7 +58,7 @@ def environment_sections(identifier: str) -> dict[str, Callable[[], str]]:
         design_names=(),
         axes=task.axes,
         moving=moving,
-        sensors=task.sensors.count if task.sensors else 0,
+        sensors=0 if task.sensors is None else task.sensors.count,
     )
     scales = observation_scales(robot) | {"position": task.goal_scale, "error": task.error_scale}
     goal_unit = task.distance_scale.goal_unit
@@ -161,7 +161,7 @@ def environment_sections(identifier: str) -> dict[str, Callable[[], str]]:
             return rest + (
                 f"The goal is the position of `{effector}` under a uniformly drawn command of the untouched body, or "
                 '`reset(options={"goal": [x, y, z]})` in metres. A touch begins at a random one of the first '
-                f"{task.window} steps, with a force of up to {quantity(task.largest_force, 'N')}, and stays."
+                f"{task.touch.window} steps, with a force of up to {quantity(task.touch.largest, 'N')}, and stays."
             )
         path = getattr(task, "path", None)
         if row.task == "track" and path is not None:

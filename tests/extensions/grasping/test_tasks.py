@@ -163,7 +163,7 @@ def test_infeasible_bodies_are_drawn_again(monkeypatch):
         ("grasp", {"forces": (0.0, 0.1)}, "forces"),
         ("grasp", {"tolerance": 0.0}, "tolerance = 0.0 must be positive"),
         ("grasp", {"resistance": -1.0}, "resistance = -1.0 m"),
-        ("lift", {}, "needs a robot whose last actuator is 'lift'; 'grasping_finger' has none"),
+        ("lift", {}, "needs a robot that lifts; robot 'grasping_finger' does not"),
     ],
     ids=str,
 )
