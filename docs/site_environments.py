@@ -238,7 +238,7 @@ def environment_top(identifier: str) -> str:
     moving = bool(row.backend_options.get("dynamics"))
     task: Any = TASKS[row.task]
     sensors = task(robot, **row.task_options).sensors
-    size = n + sensors + 3 if sensors else 3 * n + 9 + 3 * moving
+    size = 3 * n + 9 + 3 * moving if sensors is None else n + sensors.count + 3
     rows = [
         ["Action space", f"`Box(-1, 1, ({n},), float32)`"],
         ["Observation space", f"`Box(-1, 1, ({size} + k,), float32)`, `k` = design variables shown"],
