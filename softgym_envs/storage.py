@@ -45,8 +45,8 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
         raise
 
 
-def read_npz(path: str | Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """Return arrays by name from an npz file, without unpickling objects.
+def read_npz(path: str | Path, names: tuple[str, ...], optional: tuple[str, ...] = ()) -> dict[str, np.ndarray]:
+    """Return arrays by name from an npz file, without unpickling objects; ``optional`` ones if they are there.
 
     Raises:
         DataError: if the file is missing, truncated or lacks an array.
@@ -58,7 +58,7 @@ def read_npz(path: str | Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
             missing = sorted(set(names) - set(data.files))
             if missing:
                 raise DataError(f"'{path}' lacks {', '.join(missing)}")
-            return {name: data[name] for name in names}
+            return {name: data[name] for name in (*names, *(name for name in optional if name in data.files))}
     except (OSError, ValueError, EOFError, KeyError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
         raise DataError(f"'{path}' cannot be read: {_reason(error)}") from error
 

@@ -17,7 +17,8 @@ from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solids import SOLIDS
 from softgym_envs.mechanics.solvers.equilibrium import Equilibrium
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.robots.base import MeshedRobot, Robot
+from softgym_envs.robots.base import Robot
+from softgym_envs.robots.gmsh_robot import GmshRobot
 from softgym_envs.surrogate.pretrained import ships_weights
 from softgym_envs.wording import counted
 
@@ -214,7 +215,7 @@ def _through(
 
 def _refinement(robot: Robot, rest: Equilibrium) -> Iterator[Finding]:
     """Compare the compliance at rest with that of a finer mesh, where the robot meshes itself."""
-    if not isinstance(robot, MeshedRobot):
+    if not isinstance(robot, GmshRobot):
         return
     finer = type(robot)(**{**robot._options, "mesh_size": 0.7 * robot.mesh_size})  # type: ignore[arg-type]
     try:
@@ -354,7 +355,7 @@ def _variable(
     noise = float(np.sqrt((residual**2).sum(axis=1).mean()) / np.linalg.norm(rest.condensed.W.array))
     text += f", with scatter of {100 * noise:.2g} % between neighbours"
     if noise > NOISY * max(change, 1e-3):
-        yield Finding(subject, "note", text, "meshes differ from body to body: move one mesh (MeshedRobot)")
+        yield Finding(subject, "note", text, "meshes differ from body to body: move one mesh (GmshRobot)")
     else:
         yield Finding(subject, "good", text)
 

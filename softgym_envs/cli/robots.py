@@ -22,14 +22,14 @@ from softgym_envs.storage import atomic_write
 @options.as_json
 def show(robot: str, options_: tuple[str, ...], design: tuple[str, ...], picture: Path | None, as_json: bool) -> None:
     """Show a robot: its design variables, actuators and mesh."""
-    from softgym_envs.robots.base import MeshedRobot
+    from softgym_envs.robots.gmsh_robot import GmshRobot
 
     if picture is not None and picture.suffix.lower() != ".png":
         raise ConfigError(f"picture '{picture}' must end with .png")
     body = options.robot_of(robot, options_)
     chosen = options.design_of(design)
     model = body.build(chosen)
-    mesh = body.body(chosen) if isinstance(body, MeshedRobot) else None
+    mesh = body.body(chosen) if isinstance(body, GmshRobot) else None
     values = body.design_space.complete(chosen)
     if as_json:
         description = {

@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softgym_envs.designs import DesignSpace, DesignVariable
-from softgym_envs.robots.base import Actuator, MeshedRobot
+from softgym_envs.robots.base import Actuator
 from softgym_envs.robots.capabilities import Learning
 from softgym_envs.robots.geometry.meshing import BodyMesh, mesh_geometry
 from softgym_envs.robots.geometry.morphing import Feature, Plane
 from softgym_envs.robots.geometry.symmetry import mirrored, square_symmetries
+from softgym_envs.robots.gmsh_robot import GmshRobot
 from softgym_envs.robots.mesh_tiers import MeshTier
 
 if TYPE_CHECKING:
@@ -71,7 +72,7 @@ def draw_eighth(**corners: float) -> None:
     occ.intersect(leg, eighth)
 
 
-class Diamond(MeshedRobot):
+class Diamond(GmshRobot):
     """Four-legged parallel robot, pulled by four cables at its elbows.
 
     One eighth of the body is meshed and mirrored, so its response has the symmetry of its shape.
@@ -79,7 +80,7 @@ class Diamond(MeshedRobot):
     Args:
         mesh: ``"published"`` (1529 nodes and 5272 linear tetrahedra), ``"accurate"`` or ``"reference"``.
         unilateral: whether cables cannot push (default). False reproduces published scenes, where they can.
-        **options: options of `MeshedRobot`. The condensed-model work of the thesis has no gravity; its
+        **options: options of `GmshRobot`. The condensed-model work of the thesis has no gravity; its
             reinforcement-learning scene is ``gravity=(0, 0, -9.81)`` with the design ``{"young_modulus": 1.8e5}``; the
             baseline body weighs 0.5 kg.
     """

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softgym_envs.designs import Design, DesignSpace, DesignVariable
-from softgym_envs.robots.base import Actuator, Drawing, MeshedRobot
+from softgym_envs.robots.base import Actuator, Drawing
 from softgym_envs.robots.capabilities import Learning
 from softgym_envs.robots.geometry.finger_shape import check_finger, draw_finger, in_flange
 from softgym_envs.robots.geometry.graded_finger import (
@@ -27,6 +27,7 @@ from softgym_envs.robots.geometry.graded_finger import (
 from softgym_envs.robots.geometry.meshing import BodyMesh
 from softgym_envs.robots.geometry.morphing import Feature
 from softgym_envs.robots.geometry.symmetry import left_right
+from softgym_envs.robots.gmsh_robot import GmshRobot
 from softgym_envs.robots.mesh_tiers import MeshTier
 
 if TYPE_CHECKING:
@@ -70,7 +71,7 @@ higher than 22 mm) or cables would leave the body.
 """
 
 
-class SoftFinger(MeshedRobot):
+class SoftFinger(GmshRobot):
     """Cable-driven soft finger.
 
     The design box ``"wide"`` has other lengths, heights and hinges than the published one (`WIDE_BOXES`).
@@ -93,7 +94,7 @@ class SoftFinger(MeshedRobot):
         contact_distance: gap below which there are forces [m]; default 0.5 mm on the published mesh, 0.15 mm on the
             accurate one and in proportion to the ``mesh_size`` on finer ones, so that elements at the edges of the
             joints do not touch at rest.
-        **options: options of `MeshedRobot`.
+        **options: options of `GmshRobot`.
     """
 
     name = "finger"

@@ -11,8 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from softgym_envs.robots.base import Drawing, MeshedRobot, Robot
+from softgym_envs.robots.base import Drawing, Robot
 from softgym_envs.robots.geometry.meshing import BodyMesh, run_gmsh
+from softgym_envs.robots.gmsh_robot import GmshRobot
 from softgym_envs.storage import atomic_write
 
 FORMATS = (".step", ".stl")
@@ -42,7 +43,7 @@ def export_body(
     robot = robot.printable()
     if path.suffix == ".step":
         write_drawing(robot.drawing(robot.design_space.complete(design)), path, time_limit=time_limit)
-    elif isinstance(robot, MeshedRobot):
+    elif isinstance(robot, GmshRobot):
         mesh = robot.body(design)
         write_stl(path, mesh.nodes, mesh.surface())
     else:
@@ -75,7 +76,7 @@ def write_drawing(drawing: Drawing, path: str | Path, *, mesh_size: float = 0.00
     with tempfile.TemporaryDirectory() as scratch:
         output = Path(scratch) / f"part{path.suffix}"
         request = {
-            "build": f"{draw.__module__}:{draw.__qualname__}",
+            "build": draw,
             "parameters": parameters,
             "mesh_size": mesh_size,
             "output": str(output),

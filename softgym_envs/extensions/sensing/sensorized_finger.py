@@ -21,7 +21,7 @@ from softgym_envs.mechanics.constraints.cavity import Cavity, SealedAir
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.mechanics.surfaces import check_cavities
-from softgym_envs.robots.base import TOUCH_RADIUS, Actuator, MeshedRobot
+from softgym_envs.robots.base import TOUCH_RADIUS, Actuator
 from softgym_envs.robots.capabilities import LearnedTouch, Learning, Sensing
 from softgym_envs.robots.geometry.finger_shape import (
     THICKNESS,
@@ -37,6 +37,7 @@ from softgym_envs.robots.geometry.graded_finger import (
 )
 from softgym_envs.robots.geometry.meshing import BodyMesh
 from softgym_envs.robots.geometry.morphing import Feature
+from softgym_envs.robots.gmsh_robot import GmshRobot
 from softgym_envs.robots.mesh_tiers import MeshTier
 from softgym_envs.robots.soft_finger import FINGER_MESHES
 
@@ -78,7 +79,7 @@ class SensorReadings:
     stable: bool
 
 
-class SensorizedFinger(MeshedRobot):
+class SensorizedFinger(GmshRobot):
     """Cable-driven soft finger that senses the volumes of its cavities, or the pressures if they are sealed.
 
     The condensed model has the actuator (the cable), the effector (the tip point) and the sensors: one row of role
@@ -100,7 +101,7 @@ class SensorizedFinger(MeshedRobot):
             grows with Young's modulus, so that this still scales all efforts and nothing else. The touched point is a
             second effector. This is the robot that is learned, with ``meshing="morph"``: to a network, a touch is an
             input like any other.
-        **options: options of `MeshedRobot`.
+        **options: options of `GmshRobot`.
     """
 
     name = "sensorized_finger"

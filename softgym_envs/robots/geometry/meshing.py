@@ -1,7 +1,8 @@
 """Meshes from gmsh, with a cache and a time limit.
 
-A geometry is a function ``build(**parameters)`` that draws one volume in the current gmsh model **in millimetres**. It
-runs in a separate process, because OpenCASCADE may hang on an infeasible shape. Nodes are returned in metres. SciPy and
+A geometry is a function ``build(**parameters)`` that draws one volume in the current gmsh model in millimetres, or in
+metres after it has set gmsh's option ``Geometry.OCCTargetUnit`` to ``M``. It runs in a separate process, because
+OpenCASCADE may hang on an infeasible shape. Nodes are returned in metres. SciPy and
 the mechanics are imported only where they are used, as loading them takes longer than a coarse mesh in that process.
 """
 
@@ -12,20 +13,21 @@ import hashlib
 import inspect
 import json
 import os
+import pickle
 import subprocess
 import sys
 import tempfile
 import textwrap
 import traceback
 import warnings
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from importlib import import_module
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from softgym_envs.errors import DataError, InfeasibleDesign, MeshingError
+from softgym_envs.errors import DataError, InfeasibleDesign, MeshingError, unknown_name
 from softgym_envs.extras import explain
 from softgym_envs.storage import atomic_write, cache_directory, read_npz
 
@@ -45,6 +47,7 @@ class BodyMesh:
         triangles: boundary triangles, shape (k, 3).
         surfaces: geometric surface of each boundary triangle, shape (k,).
         origin: how the mesh was made: ``"meshed"``, ``"morphed"`` from another one or ``"remeshed"`` in its place.
+        groups: surfaces of each physical group of the drawing, by its name.
     """
 
     nodes: np.ndarray
@@ -52,6 +55,33 @@ class BodyMesh:
     triangles: np.ndarray
     surfaces: np.ndarray
     origin: str = "meshed"
+    groups: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+
+    def nodes_on(self, group: str) -> np.ndarray:
+        """Return the mask (n,) of the nodes on the surfaces of a group.
+
+        Raises:
+            ValueError: for a group that the drawing does not have.
+        """
+        mask = np.zeros(len(self.nodes), dtype=bool)
+        mask[self.triangles[np.isin(self.surfaces, self._surfaces_of(group))]] = True
+        return mask
+
+    def faces_of(self, group: str) -> np.ndarray:
+        """Return the triangles (k, 3) on the surfaces of a group, seen counter-clockwise from outside the material.
+
+        Raises:
+            ValueError: for a group that the drawing does not have.
+        """
+        chosen = np.sort(self.triangles[np.isin(self.surfaces, self._surfaces_of(group))], axis=1)
+        surface, count = self.surface(), len(self.nodes)
+        key = np.array([count * count, count, 1])
+        return surface[np.isin(np.sort(surface, axis=1) @ key, chosen @ key)]
+
+    def _surfaces_of(self, group: str) -> tuple[int, ...]:
+        if group not in self.groups:
+            raise ValueError(unknown_name("group of faces", group, self.groups))
+        return self.groups[group]
 
     def surface(self) -> np.ndarray:
         """Return the boundary triangles (k, 3), seen counter-clockwise from outside the material."""
@@ -90,6 +120,8 @@ class BodyMesh:
                 tetrahedra=self.tetrahedra.astype(np.int32),
                 triangles=self.triangles.astype(np.int32),
                 surfaces=self.surfaces.astype(np.int32),
+                group_names=np.array([name for name, tags in self.groups.items() for _ in tags], dtype=str),
+                group_surfaces=np.array([tag for tags in self.groups.values() for tag in tags], dtype=np.int32),
             )
 
     @classmethod
@@ -99,44 +131,54 @@ class BodyMesh:
         Raises:
             DataError: if the file is missing, truncated or of another format.
         """
-        data = read_npz(path, ("format", "nodes", "tetrahedra", "triangles", "surfaces"))
+        arrays = ("format", "nodes", "tetrahedra", "triangles", "surfaces")
+        data = read_npz(path, arrays, ("group_names", "group_surfaces"))
         if int(data["format"]) != _FORMAT:
             raise DataError(f"mesh '{path}' has format {int(data['format'])}, expected {_FORMAT}")
+        groups: dict[str, tuple[int, ...]] = {}
+        for name, tag in zip(data.get("group_names", ()), data.get("group_surfaces", ()), strict=True):
+            groups[str(name)] = (*groups.get(str(name), ()), int(tag))
         return cls(
             nodes=data["nodes"],
             tetrahedra=data["tetrahedra"].astype(np.int64),
             triangles=data["triangles"].astype(np.int64),
             surfaces=data["surfaces"].astype(np.int64),
+            groups=groups,
         )
 
 
 def mesh_geometry(
     build: Callable[..., None],
-    parameters: dict[str, float],
+    parameters: Mapping[str, Any],
     *,
     mesh_size: float,
     uses: Sequence[Callable[..., object]] = (),
+    key: Mapping[str, Any] | None = None,
     time_limit: float = 60.0,
 ) -> BodyMesh:
     """Return the mesh of a geometry, from the cache if it is stored there.
 
     Args:
-        build: module-level function that draws one volume with ``gmsh.model.occ`` in millimetres.
-        parameters: its keyword arguments.
+        build: function that draws one volume with ``gmsh.model.occ``; see this module for its unit.
+        parameters: its keyword arguments: numbers, unless there is a ``key``.
         mesh_size: target edge length [m].
         uses: other functions that the drawing calls; editing them makes a new mesh, as editing the drawing does.
+        key: what the mesh follows from besides its size, as JSON data, instead of the function and its parameters. An
+            empty one: the mesh is not kept.
         time_limit: wall-clock limit of the meshing process [s].
 
     Raises:
         InfeasibleDesign: if gmsh cannot draw or mesh the geometry, or takes too long.
         MeshingError: if gmsh cannot be imported, or the drawing function fails.
     """
-    name = f"{build.__module__}:{build.__qualname__}"
-    parameters = {key: float(value) for key, value in sorted(parameters.items())}
-    request = {"build": name, "parameters": parameters, "mesh_size": float(mesh_size)}
-    key = _cache_key(build, parameters, mesh_size, uses)
-    for folder in (_SHIPPED, cache_directory("meshes")):
-        path = folder / f"{key}.npz"
+    if key is None:
+        parameters = {name: float(value) for name, value in sorted(parameters.items())}
+        name = _cache_key(build, parameters, mesh_size, uses)
+    else:
+        name = _hash({**key, "mesh_size": float(mesh_size), "format": _FORMAT}) if key else ""
+    request = {"build": build, "parameters": parameters, "mesh_size": float(mesh_size)}
+    for folder in (_SHIPPED, cache_directory("meshes")) if name else ():
+        path = folder / f"{name}.npz"
         if path.exists():
             try:
                 return BodyMesh.load(path)
@@ -148,6 +190,8 @@ def mesh_geometry(
         output = Path(scratch) / "mesh.npz"
         run_gmsh({**request, "output": str(output)}, time_limit=time_limit)
         mesh = BodyMesh.load(output)
+    if not name:
+        return mesh
     try:
         mesh.save(path)
     except OSError as error:
@@ -163,7 +207,7 @@ def _cache_key(
 ) -> str:
     """Return the cache key of a mesh: a hash of the code and constants of its drawing functions, and its parameters."""
     code, constants = _source(build)
-    parts = {
+    parts: dict[str, Any] = {
         "code": code,
         "constants": constants,
         "parameters": parameters,
@@ -172,6 +216,10 @@ def _cache_key(
     }
     if uses:
         parts["uses"] = [_source(function) for function in uses]
+    return _hash(parts)
+
+
+def _hash(parts: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:24]
 
 
@@ -197,24 +245,29 @@ def run_gmsh(request: dict, *, time_limit: float) -> None:
     """Draw a geometry in a separate process and write it to a file.
 
     Args:
-        request: ``build`` (``module:function``), its ``parameters``, ``mesh_size`` [m] and ``output``: a path that
-            ends with .npz (a `BodyMesh`), .step (the exact shape, in mm) or .stl (its surface, in mm).
+        request: the function ``build``, its ``parameters``, ``mesh_size`` [m] and ``output``: a path that ends with
+            .npz (a `BodyMesh`), .step (the exact shape, in mm) or .stl (its surface, in mm).
         time_limit: wall-clock limit of the process [s].
 
     Raises:
         InfeasibleDesign: if gmsh cannot draw or mesh the geometry, or takes too long.
         MeshingError: if gmsh cannot be imported, or the drawing function fails.
     """
-    command = [sys.executable, "-m", "softgym_envs.robots.geometry.meshing", json.dumps(request)]
+    import cloudpickle  # also takes functions of scripts and notebooks
+
+    command = [sys.executable, "-m", "softgym_envs.robots.geometry.meshing"]
+    given = cloudpickle.dumps(request)
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
     parameters = request["parameters"]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=time_limit, env=environment, check=False)
+        done = subprocess.run(
+            command, input=given, capture_output=True, timeout=time_limit, env=environment, check=False
+        )
     except subprocess.TimeoutExpired:
         raise InfeasibleDesign(f"meshing took longer than {time_limit:g} s for {parameters}") from None
     if done.returncode == 0:
         return
-    text = done.stderr.strip()
+    text = done.stderr.decode(errors="replace").strip()
     reason = text.splitlines()[-1] if text else "no message"
     if done.returncode == _NO_GMSH:
         raise MeshingError(f"gmsh cannot be used: {reason}")
@@ -222,7 +275,8 @@ def run_gmsh(request: dict, *, time_limit: float) -> None:
         raise InfeasibleDesign(f"the geometry cannot be meshed for {parameters}: {reason}")
     if done.returncode < 0:  # OpenCASCADE crashes on some shapes
         raise InfeasibleDesign(f"gmsh crashed with signal {-done.returncode} for {parameters}")
-    raise MeshingError(f"the drawing function {request['build']} failed for {parameters}:\n{text}")
+    build = request["build"]
+    raise MeshingError(f"the drawing function {build.__module__}:{build.__qualname__} failed for {parameters}:\n{text}")
 
 
 def _draw_here(request: dict) -> None:
@@ -231,13 +285,17 @@ def _draw_here(request: dict) -> None:
 
     from softgym_envs.mechanics.gmsh_process import set_options
 
-    module, _, function = request["build"].partition(":")
     gmsh.initialize()
     try:
-        set_options(gmsh, request["mesh_size"] * 1e3)
+        size = float(request["mesh_size"])
+        set_options(gmsh, size * 1e3)
         gmsh.model.add("body")
-        getattr(import_module(module), function)(**request["parameters"])
+        request["build"](**request["parameters"])
         gmsh.model.occ.synchronize()
+        metres = gmsh.option.getString("Geometry.OCCTargetUnit") == "M"
+        if metres and gmsh.option.getNumber("Mesh.MeshSizeMax") == size * 1e3:
+            gmsh.option.setNumber("Mesh.MeshSizeMin", size)
+            gmsh.option.setNumber("Mesh.MeshSizeMax", size)
         volumes = gmsh.model.getEntities(3)
         if len(volumes) != 1:
             raise InfeasibleDesign(f"the geometry has {len(volumes)} volumes, expected one")
@@ -247,6 +305,8 @@ def _draw_here(request: dict) -> None:
                 gmsh.option.setNumber("Mesh.MeshSizeMin", 0.0)
                 gmsh.option.setNumber("Mesh.MeshSizeFromCurvature", 24)  # edges per turn
                 gmsh.option.setNumber("Mesh.Binary", 1)
+                gmsh.option.setNumber("Mesh.SaveAll", 1)  # not only named faces
+                gmsh.option.setNumber("Mesh.ScalingFactor", 1e3 if metres else 1.0)
                 gmsh.model.mesh.generate(2)
                 gmsh.model.mesh.setOutwardOrientation(volumes[0][1])
             gmsh.write(str(output))
@@ -263,7 +323,7 @@ def _draw_here(request: dict) -> None:
             surfaces.append(np.full(len(found), surface))
         if len(tetrahedra) == 0:
             raise InfeasibleDesign("gmsh made no tetrahedra")
-        nodes = coordinates.reshape(-1, 3) * 1e-3
+        nodes = coordinates.reshape(-1, 3) * (1.0 if metres else 1e-3)
         used, renumbered = np.unique(tetrahedra, return_inverse=True)
         back = np.full(len(nodes), -1)
         back[used] = np.arange(len(used))
@@ -272,6 +332,10 @@ def _draw_here(request: dict) -> None:
             tetrahedra=renumbered.reshape(tetrahedra.shape),
             triangles=back[np.concatenate(triangles)],
             surfaces=np.concatenate(surfaces),
+            groups={
+                gmsh.model.getPhysicalName(2, group): tuple(gmsh.model.getEntitiesForPhysicalGroup(2, group).tolist())
+                for _, group in gmsh.model.getPhysicalGroups(2)
+            },
         ).save(output)
     finally:
         gmsh.finalize()
@@ -280,7 +344,7 @@ def _draw_here(request: dict) -> None:
 def _main() -> int:
     """Run as the meshing process; return its exit status."""
     try:
-        _draw_here(json.loads(sys.argv[1]))
+        _draw_here(pickle.load(sys.stdin.buffer))
     except (ImportError, OSError) as problem:  # OSError: a system library that gmsh needs is missing
         print(explain(problem) or problem, file=sys.stderr)
         return _NO_GMSH

@@ -64,7 +64,18 @@ def mean_ratio(nodes: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
     return 12.0 * np.cbrt(9.0 * volume**2) * np.sign(volume) / squares
 
 
-def _extension(count: int, edges: np.ndarray, weights: np.ndarray, known: np.ndarray, anchor: float):
+def tetrahedron_edges(tetrahedra: np.ndarray) -> np.ndarray:
+    """Return the edges of tetrahedra as pairs of nodes, shape (e, 2)."""
+    pairs = np.concatenate([tetrahedra[:, [a, b]] for a in range(4) for b in range(a)])
+    return np.unique(np.sort(pairs, axis=1), axis=0)
+
+
+def inverse_lengths(nodes: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Return one over the lengths of edges (e, 2) [1/m], shape (e,)."""
+    return 1.0 / np.linalg.norm(nodes[edges[:, 0]] - nodes[edges[:, 1]], axis=1)
+
+
+def extension(count: int, edges: np.ndarray, weights: np.ndarray, known: np.ndarray, anchor: float):
     """Return a function that extends displacements from the ``known`` nodes by a weighted graph Laplacian."""
     from scipy.sparse import coo_matrix, csc_matrix, identity  # here: see `softgym_envs.robots.geometry.meshing`
     from scipy.sparse.linalg import splu
@@ -130,15 +141,11 @@ class Morpher:
         shared = (on[triangle_edges[:, 0]] & on[triangle_edges[:, 1]]).sum(axis=1)
         curve_edges = triangle_edges[shared >= 2]
 
-        def inverse_length(edges):
-            return 1.0 / np.linalg.norm(nodes[edges[:, 0]] - nodes[edges[:, 1]], axis=1)
-
-        pairs = np.concatenate([mesh.tetrahedra[:, [a, b]] for a in range(4) for b in range(a)])
-        volume_edges = np.unique(np.sort(pairs, axis=1), axis=0)
+        volume_edges = tetrahedron_edges(mesh.tetrahedra)
         self._stages = []
         for level, edges in ((3, curve_edges), (2, triangle_edges), (1, volume_edges)):
-            weights = inverse_length(edges)
-            extend = _extension(n, edges, weights, count >= level, 1e-6 * weights.mean())
+            weights = inverse_lengths(nodes, edges)
+            extend = extension(n, edges, weights, count >= level, 1e-6 * weights.mean())
             self._stages.append((level, extend))
         self._quality = float(mean_ratio(nodes, mesh.tetrahedra).min())
 

@@ -19,7 +19,8 @@ from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError, DesignError, InfeasibleDesign, unknown_name
 from softgym_envs.mechanics.solvers.equilibrium import Equilibrium
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.robots.base import MeshedRobot, Robot
+from softgym_envs.robots.base import Robot
+from softgym_envs.robots.gmsh_robot import GmshRobot
 from softgym_envs.surrogate.features import learned_variables
 
 SEQUENCES = ("halton", "sobol", "latin", "random", "vertices")
@@ -269,7 +270,7 @@ def sample_group(robot: Robot, plan: SamplingPlan, group: int) -> tuple[dict[str
     zero = np.zeros(count)
     try:
         design = plan.designs(robot, group, 1)[0]
-        if plan.one_mesh and isinstance(robot, MeshedRobot) and robot.body(design).origin != "morphed":
+        if plan.one_mesh and isinstance(robot, GmshRobot) and robot.body(design).origin != "morphed":
             return None, plan.states
         model = robot.build(design)
         statics = Statics(model)

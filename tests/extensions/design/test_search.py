@@ -186,9 +186,7 @@ def test_generations_of_nsga_are_full(stub, tmp_path):
 
 def test_nothing_feasible(stub, tmp_path):
     bodies = {**BODIES, "bounds": {"joint_height": (0.0075, 0.008)}}
-    with pytest.raises(
-        ConvergenceError, match="none of 20 designs is feasible; the first: too thick"
-    ):
+    with pytest.raises(ConvergenceError, match="none of 20 designs is feasible; the first: too thick"):
         search(configured(bodies=bodies), tmp_path, progress=False)
 
 

@@ -28,10 +28,11 @@ from softgym_envs.mechanics.constraints.servo import Servo
 from softgym_envs.mechanics.contact.obstacles import Obstacle
 from softgym_envs.mechanics.elements.quadratic import add_midside_nodes
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.robots.base import Actuator, Drawing, MeshedRobot
+from softgym_envs.robots.base import Actuator, Drawing
 from softgym_envs.robots.capabilities import Learning, View
 from softgym_envs.robots.geometry.meshing import BodyMesh, mesh_geometry
 from softgym_envs.robots.geometry.morphing import Feature
+from softgym_envs.robots.gmsh_robot import GmshRobot
 from softgym_envs.robots.mesh_tiers import MeshTier
 
 SERVO_AXIS = np.array([30.0e-3, -18.0e-3, 0.0])
@@ -46,7 +47,7 @@ CONTROL_POINTS = (7, 12)
 """Allowed numbers of control points: of the initial design of the thesis, and of its recorded studies."""
 
 
-class ContactAidedFinger(MeshedRobot):
+class ContactAidedFinger(GmshRobot):
     """Servo-driven finger whose zigzag leg touches itself as the finger closes.
 
     A positive angle of the servo lifts the left foot and bends the finger towards the object. Every design gets a mesh
