@@ -19,6 +19,7 @@ EXTRAS = {
     "minari": ("minari", "h5py", "jax"),
     "design": ("SALib",),
     "benchmark": ("pyarrow",),
+    "hardware": ("serial",),
     "measured": ("c3d", "optuna", "matplotlib"),
     "optimisers": ("botorch", "ConfigSpace", "linear_operator", "optuna_integration", "ribs", "smac"),
 }
