@@ -36,6 +36,7 @@ LAYERS = [
     {"softgym_envs.extensions", "softgym_envs.extensions.design"},
     {
         "softgym_envs.extensions.grasping",
+        "softgym_envs.extensions.hardware",
         "softgym_envs.extensions.leaderboard",
         "softgym_envs.extensions.learners",
         "softgym_envs.extensions.measured",

@@ -21,6 +21,7 @@ PACKAGES = [
     "softgym_envs.extensions.deployment",
     "softgym_envs.extensions.design",
     "softgym_envs.extensions.grasping",
+    "softgym_envs.extensions.hardware",
     "softgym_envs.extensions.leaderboard",
     "softgym_envs.extensions.modules",
     "softgym_envs.extensions.sensing",

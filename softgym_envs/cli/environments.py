@@ -27,7 +27,7 @@ AGENT_HELP = (
 )
 
 
-def _environment(id: str, agent: str, backend: str | None, verb: str) -> EnvironmentConfig:
+def environment_of_agent(id: str, agent: str, backend: str | None, verb: str) -> EnvironmentConfig:
     """Return the environment for an agent: a policy needs the same observations and actions as in training."""
     from softgym_envs.agents.baselines import BASELINES
     from softgym_envs.agents.config import EnvironmentConfig
@@ -101,7 +101,7 @@ def rollout(
         check_video(video)  # before the work begins
     chosen = options.design_of(design)
     check_agent(agent)
-    config = _environment(environment, agent, backend, "rollout")
+    config = environment_of_agent(environment, agent, backend, "rollout")
     act = make_agent(agent, seed)
     drawn = {"render_mode": "rgb_array"} if video is not None else {}
     env = config.make(**({"design": chosen} if chosen else {}), **drawn)
@@ -164,7 +164,7 @@ def record(
     if episodes < 1:
         raise ConfigError(f"--episodes {episodes} must be at least 1")
     check_agent(agent)
-    config = _environment(environment, agent, backend, "record")
+    config = environment_of_agent(environment, agent, backend, "record")
     chosen = options.design_of(design) or None
     dataset = record_episodes(name, agent, config, episodes=episodes, design=chosen, seed=seed)
     episodes_text, steps_text = counted(dataset.total_episodes, "episode"), counted(dataset.total_steps, "step")

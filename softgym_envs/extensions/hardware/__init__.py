@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from softgym_envs.extensions.hardware.device import Device as Device
     from softgym_envs.extensions.hardware.device import HardwareError as HardwareError
     from softgym_envs.extensions.hardware.device import Reading as Reading
+    from softgym_envs.extensions.hardware.serving import emulated as emulated
 
 __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
@@ -23,5 +24,6 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "backend": ["HardwareBackend"],
         "bench": ["Bench", "BenchConfig"],
         "device": ["Clock", "Device", "HardwareError", "Reading"],
+        "serving": ["emulated"],
     },
 )

@@ -79,7 +79,7 @@ class HardwareBackend(Backend):
         self._seen: np.ndarray | None = None
         self._sent, self._sent_at, self._powered = np.zeros(len(robot.actuators)), -np.inf, False
         self._began, self._heard = 0.0, -np.inf
-        self.state = self._model.state
+        self.state = self._model.step(self._sent)  # compiles what it needs, before the drives have power
 
     def _is_own(self, design: Mapping[str, float]) -> bool:
         return all(np.isclose(design[name], value, rtol=1e-9, atol=0.0) for name, value in self.design.items())
@@ -140,8 +140,9 @@ class HardwareBackend(Backend):
             return
         device.start(self.bench.watchdog, self.robot.rates * self.bench.rate)
         self._began = self._heard = clock.now()
-        if not self._powered and (found := device.read(self._began + self.bench.watchdog)) is not None:
-            self._sent = np.nan_to_num(found.displacement)  # where it stands; not known without encoders
+        if not self._powered and device.takes == "displacement":
+            if (found := device.read(self._began + ANSWER * self.bench.watchdog)) is not None:
+                self._sent = np.nan_to_num(found.displacement)  # where it stands; not known without encoders
         self._powered = True
 
     def _cycle(self, command: np.ndarray, mode: str = "displacement") -> None:
@@ -252,7 +253,7 @@ class _Log:
     """What drives did and where effectors were seen, as `softgym calibrate` reads it."""
 
     def __init__(self, path: Path, robot: Robot, takes: str, trial: str) -> None:
-        from softgym_envs.codesign.tools.measurements import columns_of
+        from softgym_envs.extensions.design.measurements import columns_of
 
         displacement, effort, effector = columns_of(robot)
         self._robot, self._moves = robot, takes == "displacement"

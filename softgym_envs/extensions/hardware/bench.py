@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,7 +22,6 @@ from softgym_envs.extensions.hardware.device import (
 )
 from softgym_envs.robots.base import Robot
 from softgym_envs.robots.registry import make_robot
-from softgym_envs.storage import write_json
 
 
 class TrackerConfig(Config):
@@ -57,7 +55,7 @@ class BenchConfig(Config):
     settings: Any = None
     tracker: TrackerConfig | None = None
     rate: float = Field(default=50.0, gt=0.0, le=1000.0)
-    watchdog: float = Field(default=0.08, ge=0.02, le=1.0)
+    watchdog: float = Field(default=0.08, ge=0.02, le=2.5)
     slow: float = Field(default=0.2, gt=0.0, le=1.0)
 
     @model_validator(mode="before")
@@ -181,12 +179,7 @@ class Timing:
             f"readings, {self.unseen} without a position"
         )
 
-    def write(self, path: str | Path) -> None:
-        """Write all of it as JSON."""
+    def to_json(self) -> dict[str, Any]:
+        """Return all of it for JSON."""
         counts = {name: getattr(self, name) for name in ("rate", "steps", "lost", "unseen", "missed")}
-        write_json(path, {**counts, "late_seconds": self.jitter})
-
-
-def timing_json(timing: Timing) -> str:
-    """Return the numbers of a loop as JSON on one line."""
-    return json.dumps({"steps": timing.steps, "lost": timing.lost, "missed": timing.missed, **timing.jitter})
+        return {**counts, "late_seconds": self.jitter}

@@ -240,7 +240,7 @@ class Dynamixel(Device):
         raw = [found[id][1] for id in self._ids]
         current = np.array([int.from_bytes(data[:2], "little", signed=True) for data in raw])
         position = np.array([int.from_bytes(data[6:10], "little", signed=True) for data in raw])
-        return Reading((position - self._zero) * self._per_tick, current * self._per_current)
+        return Reading((position - self._zero) * self._per_tick + 0.0, current * self._per_current + 0.0)
 
     def _present(self, until: float) -> dict[int, tuple[int, bytes]] | None:
         """Return error and present values of all servos, by id; None if one is missing."""

@@ -127,6 +127,9 @@ class Emulated(Protocol):
     def feed(self, now: float, data: bytes) -> bytes:
         """Take bytes at a time and return the answer."""
 
+    def move(self, now: float) -> None:
+        """Let the drives and the body move until a time."""
+
 
 # -- servos -----------------------------------------------------------------------------------------------------------
 

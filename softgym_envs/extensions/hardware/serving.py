@@ -69,9 +69,8 @@ def make_emulated(config: BenchConfig, body: SimulatedBody, losses: Losses | Non
     raise ConfigError(f"device '{config.device}' has no emulation; allowed: dynamixel, pressure_board")
 
 
-def serve(bench: dict[str, Any], options: dict[str, Any], pipe: Connection) -> None:
+def serve(config: BenchConfig, options: dict[str, Any], pipe: Connection) -> None:
     """Serve an emulated bench until the other end of a pipe is closed; sends the paths of its ports first."""
-    config = BenchConfig.model_validate(bench)
     body = SimulatedBody(
         config.make_robot(),
         config.design,
@@ -81,11 +80,12 @@ def serve(bench: dict[str, Any], options: dict[str, Any], pipe: Connection) -> N
     )
     device: Emulated = make_emulated(config, body, Losses(**options.get("losses", {})))
     line, tracker, clock = PseudoTerminal(), PseudoTerminal(), Clock()
+    device.move(clock.now())  # compiles what it needs
     pipe.send((line.path, tracker.path))
     next_position = clock.now()
     try:
         while not pipe.poll():
-            select.select([line.master, pipe], [], [], max(next_position - clock.now(), 0.0))
+            select.select([line.master, pipe.fileno()], [], [], max(next_position - clock.now(), 0.0))
             try:
                 data = os.read(line.master, 4096)
             except BlockingIOError:
@@ -116,7 +116,7 @@ def emulated(config: BenchConfig, **options: Any) -> Iterator[BenchConfig]:
     """
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
-    process = context.Process(target=serve, args=(config.model_dump(), options, theirs), daemon=True)
+    process = context.Process(target=serve, args=(config, options, theirs), daemon=True)
     process.start()
     theirs.close()
     try:

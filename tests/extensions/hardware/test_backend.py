@@ -239,7 +239,7 @@ def test_configurations_are_checked(make_bench):
 
 
 def test_the_log_has_what_calibrate_reads(make_bench, tmp_path):
-    from softgym_envs.codesign.tools.measurements import read_measurements
+    from softgym_envs.extensions.design.measurements import read_measurements
 
     moved = make_bench()
     log = tmp_path / "log.csv"

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from softgym_envs.agents.policy import Policy
-from softgym_envs.codesign import CalibrationConfig, calibrate
 from softgym_envs.envs.plant import Plant
+from softgym_envs.extensions.design import CalibrationConfig, calibrate
 from softgym_envs.extensions.hardware.emulation import Losses
 
 COLUMNS = ["cable_1_displacement", "cable_2_displacement"]
