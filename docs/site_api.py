@@ -26,6 +26,7 @@ PACKAGES = {
     "softgym_envs.codesign": "Co-design",
     "softgym_envs.extensions.design": "Extension: design without a controller",
     "softgym_envs.extensions.grasping": "Extension: grasping",
+    "softgym_envs.extensions.hardware": "Extension: physical robots",
     "softgym_envs.extensions.modules": "Extension: compliant modules",
     "softgym_envs.extensions.sensing": "Extension: sensing",
     "softgym_envs.extensions.deployment": "Extension: deployment",

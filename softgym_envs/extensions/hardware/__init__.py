@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from softgym_envs.extensions.hardware.backend import HardwareBackend as HardwareBackend
     from softgym_envs.extensions.hardware.bench import Bench as Bench
     from softgym_envs.extensions.hardware.bench import BenchConfig as BenchConfig
-    from softgym_envs.extensions.hardware.device import Clock as Clock
     from softgym_envs.extensions.hardware.device import Device as Device
     from softgym_envs.extensions.hardware.device import HardwareError as HardwareError
     from softgym_envs.extensions.hardware.device import Reading as Reading
@@ -23,7 +22,7 @@ __getattr__, __dir__, __all__ = lazy_exports(
     {
         "backend": ["HardwareBackend"],
         "bench": ["Bench", "BenchConfig"],
-        "device": ["Clock", "Device", "HardwareError", "Reading"],
+        "device": ["Device", "HardwareError", "Reading"],
         "serving": ["emulated"],
     },
 )
