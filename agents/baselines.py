@@ -147,7 +147,7 @@ class CorrectedQPAgent(ModelQPAgent):
 
 
 class RandomAgent:
-    """Uniform actions.
+    """Uniform actions; those of `Robot.antagonists` are balanced.
 
     Args:
         seed: of the actions.
@@ -160,7 +160,12 @@ class RandomAgent:
 
     def __call__(self, observation: Any, env: Any) -> np.ndarray:
         """Return an action, shape (n_a,)."""
-        return self._rng.uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32)
+        action = self._rng.uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32)
+        inner = env.unwrapped
+        if not inner.robot.antagonists:
+            return action
+        present = inner.state.command
+        return np.asarray(inner.spaces.action(inner.robot.balanced(inner.spaces.command(action, present)), present))
 
 
 BASELINES = Table(

@@ -67,7 +67,7 @@ def family_goals(config: StudyConfig, count: int) -> np.ndarray:
     drawn = [robot.design_space.sample(rng, vary) for _ in range(count)]
     designs = [[body[n] if n in vary else value for n, value in config.baseline.items()] for body in drawn]
     low = robot.lower + goals.command_low * (robot.upper - robot.lower)
-    commands = rng.uniform(low, robot.upper, (count, len(low)))
+    commands = robot.balanced(rng.uniform(low, robot.upper, (count, len(low))))
     model = pretrained_model(robot, config.environment.backend_options.get("weights"))
     unilateral = robot.unilateral
     settled = solve_displacements(

@@ -282,7 +282,7 @@ def _commands(
         unit = effort_unit(actuator.unit)
         text = f"'{actuator.name}' needs {values.min():.3g} to {values.max():.3g} {unit}"
         if np.abs(values).max() > STRAINED * typical:
-            remedy = f"actuators fight each other: override `displacements`, or effort_scale ({typical:g}) is too small"
+            remedy = f"do they fight each other? name `antagonists`; or effort_scale ({typical:g}) is too small"
             yield Finding("efforts", "note", text, remedy)
         elif (beyond := int((np.abs(values) > actuator.max_effort).sum())) > 0:
             remedy = f"{counted(beyond, 'command')} beyond max_effort = {actuator.max_effort:g} {unit}: a smaller range"

@@ -46,18 +46,24 @@ def fit(config: Path, folder: Path, data: Path | None, quiet: bool, overrides: t
     stopped.
     """
     from softgym_envs.config import load_config
+    from softgym_envs.robots.registry import make_robot
+    from softgym_envs.storage import read_json
     from softgym_envs.surrogate.parts.training import PartConfig, fit_part
-    from softgym_envs.surrogate.training import FitConfig
+    from softgym_envs.surrogate.training import FitConfig, account
     from softgym_envs.surrogate.training import fit as run
 
     if _is_part(config):
         part = load_config(config, PartConfig, overrides)
         click.echo(json.dumps(fit_part(part, folder, data or folder / "data", progress=not quiet), indent=2))
         return
+    wanted = load_config(config, FitConfig, overrides)
     with options.resumable():
-        errors = run(load_config(config, FitConfig, overrides), folder, data or folder / "data", progress=not quiet)
+        errors = run(wanted, folder, data or folder / "data", progress=not quiet)
     click.echo(json.dumps(errors, indent=2))
     click.echo("errors of the effector are in metres, all others are shares (1 is 100%)", err=True)
+    robot = make_robot(wanted.robot, **wanted.robot_options)
+    for line in account(robot, read_json(folder / "model.json")):
+        click.echo(line, err=True)
 
 
 def _is_part(config: Path) -> bool:

@@ -96,6 +96,8 @@ class Robot(ABC):
         size: a characteristic length [m], for scaling.
         effector_rest: nominal effector of the baseline body at rest [m], before loads, shape (3,).
         effort_scale: typical effort of each actuator of the baseline body [N, ...], shape (n_a,).
+        antagonists: groups of actuators, by name, that pull against each other, such as the tendons around a rod: what
+            some pull, the others let out. Commands of fits, goals and random agents are balanced in each group.
         goal_axes: which coordinates of the first effector count towards a goal, 1 or 0, shape (3,).
         goal_tolerance: distance at which a goal counts as reached [m].
         workspace_scale: distance over which the effector typically moves [m], by default a quarter of the size; scales
@@ -120,6 +122,7 @@ class Robot(ABC):
     size: float
     effector_rest: np.ndarray
     effort_scale: np.ndarray
+    antagonists: tuple[tuple[str, ...], ...] = ()
     goal_axes: np.ndarray = np.ones(3)
     goal_tolerance: float = 0.002
     workspace_scale: float
@@ -206,7 +209,7 @@ class Robot(ABC):
 
         Robots whose actuators never move independently override this to sample only commands that occur.
         """
-        return self.lower + fractions * (self.upper - self.lower)
+        return self.balanced(self.lower + fractions * (self.upper - self.lower))
 
     # -- what follows from it ---------------------------------------------------------------------------------------
 
@@ -233,6 +236,31 @@ class Robot(ABC):
         except Exception as error:
             error.add_note(f"while assembling robot '{self.name}' for {complete}")
             raise
+
+    def balanced(self, commands: Any) -> Any:
+        """Return commands (..., n_a), an array or a tensor, in which `antagonists` do not pull against each other.
+
+        Their mean is taken off each group, which is then scaled into its range if it left that.
+        """
+        names = [actuator.name for actuator in self.actuators]
+        columns = [commands[..., k] for k in range(len(names))]
+        for group in self.antagonists:
+            chosen = [names.index(name) for name in group]
+            mean = sum(columns[k] for k in chosen) / len(chosen)
+            beyond = mean * 0.0 + 1.0
+            for k in chosen:
+                columns[k] = columns[k] - mean
+                share = abs(columns[k]) / self.actuators[k].high
+                beyond = 0.5 * (beyond + share + abs(beyond - share))  # the larger one, in numpy and torch
+            for k in chosen:
+                columns[k] = columns[k] / beyond
+        if not self.antagonists:
+            return commands
+        if isinstance(commands, np.ndarray):
+            return np.stack(columns, axis=-1)
+        import torch
+
+        return torch.stack(columns, dim=-1)
 
     def of_parts(self, parts: Mapping[str, Callable[[Mapping[str, float], np.ndarray], dict[str, Any]]]) -> Robot:
         """Return the robot whose bodies have learned parts in place of finite elements; see `learned_parts`."""

@@ -100,6 +100,7 @@ def check_robot(robot: Robot) -> None:
         if not np.isfinite(value).all():
             raise ValueError(f"robot '{robot.name}': {name} must be finite, got {value.tolist()}")
         setattr(robot, name, value)
+    _check_antagonists(robot)
     # Rewards and observations are divided by these.
     scales = {name: getattr(robot, name) for name in ("size", "effort_scale", "goal_tolerance", "workspace_scale")}
     for name, given in {**scales, "sensing.scale": robot.sensing.scale}.items():
@@ -120,6 +121,26 @@ def _complete_learning(robot: Robot) -> None:
     robot.learning = replace(
         learning, weights=learning.weights or robot.name, stiffness_variable=None if others else name
     )
+
+
+def _check_antagonists(robot: Robot) -> None:
+    """Raise ValueError for groups of antagonists that are no groups of actuators, or cannot be let out."""
+    actuators = {actuator.name: actuator for actuator in robot.actuators}
+    owner, seen = f"robot '{robot.name}': antagonists", set()
+    for group in robot.antagonists:
+        if isinstance(group, str) or len(group) < 2:
+            raise ValueError(f"{owner} must be groups of two or more names, got {group!r}")
+        for name in group:
+            if name not in actuators:
+                raise ValueError(f"{owner}: {unknown_name('actuator', name, actuators)}")
+            if name in seen:
+                raise ValueError(f"{owner}: '{name}' is in two groups")
+            seen.add(name)
+            high, low = actuators[name].high, actuators[name].low
+            if low != -high or high != actuators[group[0]].high:
+                raise ValueError(
+                    f"{owner}: '{name}' has the range {low:g} to {high:g}; a group needs one range, from -high to high"
+                )
 
 
 def _check_quantities(robot: Robot) -> None:

@@ -8,6 +8,7 @@ import json
 import operator
 import shutil
 import time
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -16,21 +17,25 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from softgym_envs.config import BesideConfig, Config
+from softgym_envs.errors import ConfigError
 from softgym_envs.extras import require
+from softgym_envs.mechanics.condensation import effort_unit
 from softgym_envs.robots.base import Robot
 from softgym_envs.robots.registry import make_robot
 from softgym_envs.runs import RunFolder
 from softgym_envs.storage import atomic_write
 from softgym_envs.surrogate.correction import fit_correction
-from softgym_envs.surrogate.data.dataset import generate_dataset
+from softgym_envs.surrogate.data.dataset import generate_dataset, lost
 from softgym_envs.surrogate.data.sampling import SamplingPlan
 from softgym_envs.surrogate.data.states import full_compliance, stable_rows, training_states, with_images
+from softgym_envs.surrogate.domain import DISTRUST_REASONS
 from softgym_envs.surrogate.features import Features
 from softgym_envs.surrogate.model import SurrogateModel, definite
 from softgym_envs.surrogate.networks import NETWORKS, network_module
 from softgym_envs.surrogate.row_errors import RowErrors
 from softgym_envs.surrogate.trainer import Trainer
 from softgym_envs.surrogate.weight_files import load_model, new_card, save_model
+from softgym_envs.wording import counted
 
 SPLITS = ("train", "validation", "test")
 
@@ -184,6 +189,8 @@ class FitConfig(Config):
         workers: number of processes that solve FEM states.
         executor: ``"processes"`` of this machine, or ``"ray"`` for tasks of a cluster.
         seed: seed of the training.
+        alone: whether the model will run alone. False for a robot with a ``max_effort``, whose model serves the backend
+            ``hybrid`` or a chain of learned parts: they know efforts.
         trust: calibrate the uncertainty under commands, by stratum; None leaves it calibrated on the validation states.
     """
 
@@ -196,6 +203,7 @@ class FitConfig(Config):
     workers: int = Field(default=2, gt=0)
     executor: Literal["processes", "ray"] = "processes"
     seed: int = 0
+    alone: bool = True
     trust: TrustConfig | None = None
 
     @model_validator(mode="after")
@@ -252,6 +260,68 @@ def measure_errors(model: SurrogateModel, data: dict[str, np.ndarray]) -> dict[s
     }
 
 
+def trusted_part(model: SurrogateModel, data: dict[str, np.ndarray]) -> dict[str, Any]:
+    """Return how much of a dataset a model is trusted on, and its errors there and elsewhere.
+
+    Returns:
+        ``share`` of the stable states that are trusted; ``effector_p95``, below which 95 % of the errors of these lie,
+        and ``elsewhere_p95``, of the others [m] (None without any); ``reasons``: share of the states for each reason of
+        distrust; ``effort``: largest effort of each actuator in the data.
+    """
+    data = {name: column[stable_rows(model.robot, data)] for name, column in data.items()}
+    context = model.context(data["design"])
+    _, effector, spread = model.state(context, data["displacement"])
+    truth = data["effector"][:, : model.effectors]
+    error = np.linalg.norm((effector - truth).reshape(len(spread), -1, 3), axis=2).max(axis=1)
+    code = model.distrust(context, data["displacement"], spread)[1]
+    parts = {"effector_p95": error[code == 0], "elsewhere_p95": error[code != 0]}
+    return {
+        "share": float((code == 0).mean()),
+        **{name: float(np.quantile(values, 0.95)) if len(values) else None for name, values in parts.items()},
+        "reasons": {text: float(((code & n) > 0).mean()) for n, text in DISTRUST_REASONS.items() if (code & n).any()},
+        "effort": np.abs(data["effort"]).max(axis=0).tolist(),
+    }
+
+
+def account(robot: Robot, card: Mapping[str, Any]) -> list[str]:
+    """Return what a fit did, in sentences: states kept and lost, and where its model can be trusted.
+
+    Args:
+        robot: the robot.
+        card: of the weights.
+    """
+    lines = []
+    for split, states in card["states"].items():
+        bodies, commands = card.get("lost", {}).get(split, (0, 0))
+        unstable = card["unstable_states_left_out"][split]
+        kinds = ((bodies, "body", "that cannot be built or held"), (commands, "command", "without an equilibrium"))
+        parts = [
+            f"{counted(n, name)} {why}" for n, name, why in (*kinds, (unstable, "state", "too unstable to learn")) if n
+        ]
+        lines.append(f"{split}: {counted(states, 'state')}; lost: {', '.join(parts) or 'nothing'}")
+    found = card.get("trusted")
+    if found is None:
+        return lines
+    for actuator, largest, typical in zip(robot.actuators, found["effort"], robot.effort_scale, strict=True):
+        if largest > 10.0 * typical:
+            lines.append(
+                f"'{actuator.name}' needs up to {largest:.3g} {effort_unit(actuator.unit)}, {largest / typical:.0f} "
+                "times its effort_scale: do actuators fight each other? (`Robot.antagonists`, `softgym check`)"
+            )
+    tested = counted(int(card["test"]["states"]), "test state")
+    text = f"It can be trusted on {found['share']:.0%} of {tested} of new bodies"
+    if found["effector_p95"] is not None:
+        text += f", where 95 % of the errors of the effector are below {1e3 * found['effector_p95']:.2g} mm"
+    if found["elsewhere_p95"] is not None:
+        text += f"; elsewhere below {1e3 * found['elsewhere_p95']:.2g} mm"
+    lines.append(text + ".")
+    if reasons := ", ".join(f"{reason} {share:.0%}" for reason, share in found["reasons"].items()):
+        lines.append(f"Not trusted because of: {reasons}.")
+    if found["share"] < 0.5:
+        lines.append("Take more bodies (data.train.groups), narrower ranges, or fewer variables (data.vary).")
+    return lines
+
+
 def row_errors(model: SurrogateModel, data: dict[str, np.ndarray]) -> RowErrors:
     """Return the errors of effectors [m] and sensors under the displacements of a dataset."""
     data = {name: column[stable_rows(model.robot, data)] for name, column in data.items()}
@@ -299,6 +369,25 @@ def domain_of(
     return domain
 
 
+def check_learnable(robot: Robot, config: FitConfig) -> None:
+    """Refuse, before any state is solved, a robot whose learned model no backend would take.
+
+    Raises:
+        ConfigError: for obstacles, and for actuators with a largest effort if the model is to run alone.
+    """
+    if robot.obstacles or type(robot).own_obstacles is not Robot.own_obstacles:
+        raise ConfigError(
+            f"robot '{robot.name}' touches obstacles, which a surrogate does not learn: use backend='fem', or fit it "
+            "without them"
+        )
+    limited = [actuator.name for actuator in robot.actuators if np.isfinite(actuator.max_effort)]
+    if config.alone and limited:
+        raise ConfigError(
+            f"robot '{robot.name}': a surrogate would drive {', '.join(limited)} beyond max_effort: leave it out and "
+            "check efforts afterwards, or set alone = false for backend='hybrid'"
+        )
+
+
 def generate_datasets(config: FitConfig, data_folder: str | Path, *, progress: bool = True) -> Datasets:
     """Return the datasets of a surrogate; whatever is missing is generated.
 
@@ -307,6 +396,7 @@ def generate_datasets(config: FitConfig, data_folder: str | Path, *, progress: b
         ``pretraining/train`` and ``pretraining/validation``; with a correction also ``correction/coarser``,
         ``correction/own`` and ``correction/finer``.
     """
+    check_learnable(make_robot(config.robot, **config.robot_options), config)
     run = RunFolder(data_folder, FitConfig, "datasets")
     if not run.begun:  # an existing file is kept until the data are accepted
         run.begin(config)
@@ -386,6 +476,8 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
         **({"errors": row_errors(model, data["validation"]).to_card()} if model.sensors else {}),
         "correction": _correction(config, data, features),
     }
+    card["lost"] = {name: lost(data_folder / name) for name in data}
+    card["trusted"] = trusted_part(Model(robot, trained.tensors, card), data["test"])
     save_model(Model(robot, trained.tensors, card), folder)
     history = {f"{p}_{k}": np.array([row[k] for row in rows]) for p, rows in trained.histories.items() for k in rows[0]}
     with atomic_write(folder / "history.npz") as stream:

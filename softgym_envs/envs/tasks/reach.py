@@ -45,5 +45,5 @@ class Reach(Task):
             return self.fixed_goals[rng.integers(len(self.fixed_goals), size=count)][:, None]
         high = self.robot.upper
         low = self.robot.lower + self.command_low * (high - self.robot.lower)
-        goals = kinematics(rng.uniform(low, high, (count, len(low))))
+        goals = kinematics(self.robot.balanced(rng.uniform(low, high, (count, len(low)))))
         return (goals + rng.uniform(-self.spread, self.spread, goals.shape))[:, None]

@@ -194,11 +194,7 @@ def _make_missing(
 
 def _write_card(path: Path, manifest: dict[str, Any], data: dict[str, np.ndarray]) -> None:
     """Write the card that describes the dataset to people."""
-    failed = infeasible = 0
-    for shard in _shards(path.parent, manifest):
-        with np.load(shard, allow_pickle=False) as content:
-            failed += int(content["failed"]) if "failed" in content else 0
-            infeasible += int(content["infeasible"]) if "infeasible" in content else 0
+    infeasible, failed = lost(path.parent)
     lines = [
         f"# States of robot `{manifest['robot']}`",
         "",
@@ -219,6 +215,20 @@ def _write_card(path: Path, manifest: dict[str, Any], data: dict[str, np.ndarray
     lines += ["", "SI units; lengths of cables as shortening. `rest` marks the first state of each body.", ""]
     with atomic_write(path, "w") as stream:
         stream.write("\n".join(lines))
+
+
+def lost(folder: str | Path) -> tuple[int, int]:
+    """Return how many bodies and commands of a finished dataset were left out, since they have no equilibrium.
+
+    Raises:
+        DataError: if the manifest is missing or damaged.
+    """
+    bodies = commands = 0
+    for shard in _shards(Path(folder), _read_manifest(Path(folder) / "manifest.json")):
+        with np.load(shard, allow_pickle=False) as content:
+            commands += int(content["failed"]) if "failed" in content else 0
+            bodies += int(content["infeasible"]) if "infeasible" in content else 0
+    return bodies, commands
 
 
 def _shards(folder: Path, manifest: dict[str, Any]) -> list[Path]:
