@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -42,6 +43,11 @@ def check_backend(name: str, robot: Robot, options: Mapping[str, object]) -> Non
         ValueError: for an unknown name or option, or a value of the wrong type.
     """
     check_options(f"backend '{name}'", backend_class(name, robot), 2, options)
+
+
+def takes_option(name: str, robot: Robot, option: str) -> bool:
+    """Return whether a robot's backend with a name has an option."""
+    return option in inspect.signature(backend_class(name, robot)).parameters
 
 
 def make_backend(name: str, robot: Robot, design: Mapping[str, float] | None = None, **options: object) -> Backend:

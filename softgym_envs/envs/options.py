@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode
 
 from softgym_envs.backends.batch import BatchBackend
 from softgym_envs.backends.one_by_one import OneByOne
-from softgym_envs.backends.registry import batch_class, check_backend, make_backend
+from softgym_envs.backends.registry import batch_class, check_backend, make_backend, takes_option
 from softgym_envs.backends.time_steps import shared_options
 from softgym_envs.designs import Design, DesignSpace
 from softgym_envs.envs.plant import Plants
@@ -170,11 +170,12 @@ def set_up(robot: RobotSource | None, task: TaskSource, backend: str | None, opt
     backend_options = dict(options.backend_options or {})
     if backend is None:
         backend = default_backend(made, backend_options)
-    if backend == defaults.get("backend"):
-        usual = defaults.get("backend_options", {})
-        if not backend_options.get("dynamics", True):  # without motion, its options have no effect
-            usual = {name: value for name, value in usual.items() if name not in shared_options(usual)}
-        backend_options = {**usual, **backend_options}
+    usual = defaults.get("backend_options", {})
+    if backend != defaults.get("backend"):  # of other backends, those that move bodies too do so
+        usual = shared_options(usual) if takes_option(backend, made, "dynamics") else {}
+    if not backend_options.get("dynamics", True):  # without motion, its options have no effect
+        usual = {name: value for name, value in usual.items() if name not in shared_options(usual)}
+    backend_options = {**usual, **backend_options}
     check_backend(backend, made, backend_options)
     space = made.design_space
     plant = defaults.get("plant") if options.plant is None else options.plant

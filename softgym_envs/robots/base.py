@@ -268,6 +268,10 @@ class Robot(ABC):
         made.parts = parts
         return made
 
+    def learned_mesh(self) -> Robot:
+        """Return the robot on the mesh from which its `learned_parts` were learned."""
+        return self
+
     def printable(self) -> Robot:
         """Return the robot whose solid parts are this one's body; it takes the same designs."""
         return self

@@ -5,6 +5,7 @@ The published frame has y up. Here z is up: the published (x, y, z) is (x, z, -y
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -71,7 +72,10 @@ class Tetrapod(Robot):
     rest_mode = "displacement"
     made_of_beams = True
     learned_parts = ("leg",)
-    backends = {"surrogate": "softgym_envs.backends.parts:PartsBackend"}
+    backends = {
+        "surrogate": "softgym_envs.backends.parts:PartsBackend",
+        "hybrid": "softgym_envs.backends.parts:PartsHybridBackend",
+    }
     non_mechanical_options = (*Robot.non_mechanical_options, "servo_range")
 
     def __init__(
@@ -174,6 +178,11 @@ class Tetrapod(Robot):
         side = CENTRE_RADIUS - JOINT_GAP
         model.skins.append(box_skin(centre, (side, side, 0.4 * CENTRE_RADIUS), model.nodes))
         return model
+
+    def learned_mesh(self) -> Robot:
+        made = copy.copy(self)
+        made.elements = MESHES["accurate"]
+        return made
 
     def reference_path(self, count: int = 60) -> np.ndarray:
         """Horizontal circle of radius 40 mm about the hanging position, 10 mm higher, shape (count, 3)."""

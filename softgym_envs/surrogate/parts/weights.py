@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -77,11 +77,13 @@ def read_leg(folder: str | Path | None = None) -> tuple[dict[str, Any], dict[str
     Raises:
         WeightsError: if a file is missing or damaged, or of another part; the message names the file.
     """
-    return _read(SHIPPED if folder is None else Path(folder).resolve())
+    folder = (SHIPPED if folder is None else Path(folder)).resolve()
+    card = folder / "model.json"
+    return _read(folder, card.stat().st_mtime_ns if card.is_file() else 0)
 
 
-@cache
-def _read(folder: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+@lru_cache(maxsize=4)
+def _read(folder: Path, version: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     from safetensors import SafetensorError
     from safetensors.numpy import load_file
 
@@ -143,6 +145,7 @@ class LearnedLeg:
 
     Attributes:
         card: of the weights.
+        wrong: how far tips may move under the errors of their wrenches, over the length.
 
     Raises:
         WeightsError: as `read_leg`.
@@ -150,13 +153,13 @@ class LearnedLeg:
 
     def __init__(self, folder: str | Path | None = None) -> None:
         self.card, self._tensors = read_leg(folder)
-        self._wrong = float(self.card.get("trust", {}).get("wrong", self.card["test"]["moved_p95"]))
+        self.wrong = float(self.card.get("trust", {}).get("wrong", self.card["test"]["moved_p95"]))
 
     def __call__(self, design: Mapping[str, float], gravity: np.ndarray) -> dict[str, Any]:
         """Return the options of `PoseParts` for the legs of a body."""
         scale = LegScale.of(design)
         return {
-            "energy": LegEnergy(self._tensors, scale.shape, self._wrong),
+            "energy": LegEnergy(self._tensors, scale.shape, self.wrong),
             "length": float(scale.length),
             "scale": float(scale.energy),
             "weight": float(scale.weight) * gravity,

@@ -1,0 +1,171 @@
+"""How wrong bodies of learned parts are, and the calibration of what they say about it, on finite elements."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from softgym_envs.errors import ConvergenceError, InfeasibleDesign
+from softgym_envs.mechanics.condensation import CondensedModel
+from softgym_envs.mechanics.solvers.equilibrium import Equilibrium
+from softgym_envs.mechanics.solvers.statics import Statics
+from softgym_envs.robots.base import Robot
+from softgym_envs.storage import read_json, write_json
+from softgym_envs.surrogate.data.strata import draw_commands
+from softgym_envs.surrogate.parts.trust import Judged, judge
+from softgym_envs.surrogate.parts.weights import LearnedLeg
+
+COVERAGE = 0.95
+INCREMENTS = 20
+"""Increments in which a command is approached from rest: of several equilibria both models are to find the same."""
+STRATA = ("inside", "faces", "corners")
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """States of bodies of learned parts beside those of finite elements, N states.
+
+    Attributes:
+        stratum: as `surrogate.data.strata.DRAWN`, shape (N,).
+        command: shape (N, n_a).
+        error: distance of the first effector from that of finite elements [m], shape (N,).
+        effort: largest error of an effort over the largest effort, shape (N,).
+        held: relative error of the compliance of the effector while the actuators are held, shape (N,).
+        jacobian: relative error of the effector's derivative by the displacements, shape (N,).
+        uncertainty: [m], shape (N,).
+        stiffness: as `Judged`, shape (N,).
+        known: likewise.
+        trusted: shape (N,).
+        lost: commands for which finite elements found no equilibrium.
+        failed: commands for which the parts found none, though there is one; they count as not trusted.
+    """
+
+    stratum: np.ndarray
+    command: np.ndarray
+    error: np.ndarray
+    effort: np.ndarray
+    held: np.ndarray
+    jacobian: np.ndarray
+    uncertainty: np.ndarray
+    stiffness: np.ndarray
+    known: np.ndarray
+    trusted: np.ndarray
+    lost: int
+    failed: int
+
+    def summary(self, rows: np.ndarray) -> dict[str, float]:
+        """Return what is known of some of the states: means, and largest errors of trusted ones [mm, shares]."""
+        trusted = rows & self.trusted
+        best = trusted if trusted.any() else rows
+        return {
+            "states": int(rows.sum()),
+            "mean [mm]": 1e3 * float(self.error[rows].mean()),
+            "median [mm]": 1e3 * float(np.median(self.error[rows])),
+            "trusted": float(self.trusted[rows].mean()),
+            "trusted: mean [mm]": 1e3 * float(self.error[best].mean()),
+            "trusted: 95 % [mm]": 1e3 * float(np.quantile(self.error[best], 0.95)),
+            "trusted: worst [mm]": 1e3 * float(self.error[best].max()),
+            "trusted: effort, 90 %": float(np.quantile(self.effort[best], 0.9)),
+            "trusted: held W, 90 %": float(np.quantile(self.held[best], 0.9)),
+            "trusted: derivative by commands, 90 %": float(np.quantile(self.jacobian[best], 0.9)),
+            "coverage": float((self.error <= self.uncertainty)[rows].mean()),
+        }
+
+
+def approach(statics: Statics, robot: Robot, command: np.ndarray) -> Equilibrium:
+    """Return the equilibrium under a command that is approached slowly from rest.
+
+    Raises:
+        ConvergenceError: if it is not found.
+    """
+    found = statics.solve(np.zeros(len(command)), robot.rest_mode)
+    for share in np.linspace(0.0, 1.0, INCREMENTS + 1)[1:]:
+        found = statics.solve(share * command)
+    return found
+
+
+def compare(robot: Robot, part: LearnedLeg, *, bodies: int, seed: int, strata: tuple[str, ...] = STRATA) -> Comparison:
+    """Return how bodies of parts compare with finite elements, one command for each body.
+
+    Args:
+        robot: on its mesh of finite elements.
+        part: the learned part.
+        bodies: of each stratum.
+        seed: of bodies and commands.
+        strata: see `surrogate.data.strata.DRAWN`.
+    """
+    learned, rows, lost, failed = robot.of_parts({"leg": part}), [], 0, 0
+    held = np.ones(len(robot.actuators), dtype=bool)
+    for stratum in strata:
+        drawn = draw_commands(robot, stratum, bodies, 1, seed)
+        for values, commands in zip(drawn.design.tolist(), drawn.command, strict=True):
+            design = dict(zip(robot.design_space.names, values, strict=True))
+            command = commands[0]
+            try:
+                true = approach(Statics(robot.build(design)), robot, command).condensed
+            except (ConvergenceError, InfeasibleDesign):
+                lost += 1
+                continue
+            statics = Statics(learned.build(design))
+            try:
+                found = approach(statics, robot, command)
+            except ConvergenceError:
+                failed += 1
+                continue
+            judged = judge(statics, robot, found.x, found.effort, held)
+            rows.append((stratum, command, *_errors(found.condensed, true), *_verdict(judged)))
+    return Comparison(*(np.array(column) for column in zip(*rows, strict=True)), lost, failed)
+
+
+def _verdict(judged: Judged) -> tuple[float, float, bool, bool]:
+    return judged.uncertainty, judged.stiffness, judged.known, judged.distrust == 0
+
+
+def _errors(found: CondensedModel, true: CondensedModel) -> tuple[float, float, float, float]:
+    def parts(model: CondensedModel) -> tuple[np.ndarray, np.ndarray]:
+        W = model.W
+        jacobian = np.linalg.solve(W.aa, W.ae).T
+        return W.ee - jacobian @ W.ae, jacobian
+
+    held, jacobian = (
+        float(np.linalg.norm(a - b) / np.linalg.norm(b)) for a, b in zip(parts(found), parts(true), strict=True)
+    )
+    effort = np.abs(found.lambda_.a - true.lambda_.a).max() / np.abs(true.lambda_.a).max()
+    return float(np.linalg.norm(found.delta.e[:3] - true.delta.e[:3])), float(effort), held, jacobian
+
+
+def calibrate_parts(
+    folder: str | Path, robot: Robot, *, bodies: int, seed: int, states: int = 1
+) -> Mapping[str, Mapping[str, float]]:
+    """Calibrate how far bodies of parts may be off, and write the result to the card of the weights.
+
+    The errors of the parts are scaled so that the uncertainty covers `COVERAGE` of the errors of the effector inside
+    the design box; other strata are reported.
+
+    Args:
+        folder: of the weights.
+        robot: on its mesh of finite elements.
+        bodies: of each stratum.
+        seed: of bodies and commands.
+        states: commands of each body; one, since each is approached from rest.
+
+    Returns:
+        What `Comparison.summary` says of each stratum.
+    """
+    if states != 1:
+        raise ValueError(f"states = {states}: of bodies of learned parts, each has one command; allowed: 1")
+    folder = Path(folder)
+    found = compare(robot, LearnedLeg(folder), bodies=bodies, seed=seed)
+    sound = found.known & (found.stratum == "inside")
+    ratio = np.sort(found.error[sound] / found.uncertainty[sound])
+    rank = min(int(np.ceil((len(ratio) + 1) * COVERAGE)), len(ratio))
+    path = folder / "model.json"
+    card = read_json(path)
+    part = LearnedLeg(folder)
+    trust = {"wrong": part.wrong * float(ratio[rank - 1]), "bodies": bodies, "seed": seed}
+    write_json(path, {**card, "trust": trust})
+    again = compare(robot, LearnedLeg(folder), bodies=bodies, seed=seed)
+    return {stratum: again.summary(again.stratum == stratum) for stratum in STRATA}
