@@ -13,7 +13,7 @@ from typing import Any
 
 import click
 
-from benchmarks import beams, gpu, speed
+from benchmarks import beams, gpu, parts, speed
 from softgym_envs.errors import ConfigError, unknown_name
 from softgym_envs.runs import provenance
 from softgym_envs.storage import write_json
@@ -27,6 +27,7 @@ BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
     "fem_profile": speed.fem_profile,
     "fem_speed": speed.fem_speed,
     "beams": beams.beams,
+    "learned_tetrapod": parts.learned_tetrapod,
     "notched_beam": speed.notched_beam,
     "surrogate_step": speed.surrogate_step,
     "gpu_step": gpu.gpu_step,

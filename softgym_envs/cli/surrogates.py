@@ -109,12 +109,19 @@ def calibrate_trust(
     Bodies are drawn in strata, such as inside the design box and at its corners. The uncertainty is scaled until it
     covers 95 % of the errors under commands in each stratum. Then the limit of trust is lowered until a search finds
     no trusted state that is off by more than the goal tolerance. The result is written to the card of the weights.
+    Bodies of learned parts have one command each, and no search.
     """
     from dataclasses import asdict
 
     from softgym_envs.surrogate.calibration import calibrate
 
     body = options.robot_of(robot, options_)
+    if body.learned_parts:
+        from softgym_envs.surrogate.parts.calibration import calibrate_parts
+
+        found_of_parts = calibrate_parts(weights, body.learned_mesh(), bodies=bodies, seed=seed)
+        click.echo(json.dumps(found_of_parts, indent=2))
+        return
     with nullcontext() if folder is None else options.resumable():
         found = calibrate(
             weights, body, bodies=bodies, states=states,

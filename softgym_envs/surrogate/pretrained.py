@@ -103,13 +103,14 @@ def standalone_model(robot: Robot, weights: str | Path | None = None, members: i
     Raises:
         WeightsError: also for actuators with a largest effort, which learned models do not know.
     """
-    model = pretrained_model(robot, weights, members)
     if limited := [actuator.name for actuator in robot.actuators if math.isfinite(actuator.max_effort)]:
+        kept = weights is not None or ships_weights(robot)
+        hybrid = "'hybrid'" if kept else "'hybrid' with weights of 'softgym fit'"
         raise WeightsError(
             f"robot '{robot.name}': a surrogate drives actuators beyond their max_effort ({', '.join(limited)}); use "
-            "backend='fem' or 'hybrid'"
+            f"backend='fem' or {hybrid}"
         )
-    return model
+    return pretrained_model(robot, weights, members)
 
 
 def shipped_robots() -> dict[str, tuple[str, dict[str, Any]]]:

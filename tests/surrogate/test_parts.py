@@ -209,7 +209,7 @@ def test_W_is_the_exact_derivative(learned):
 
 
 def test_other_folders_and_parts_are_refused(tmp_path):
-    with pytest.raises(WeightsError, match="of a leg does not exist; train it with 'softgym fit --config tetrapod_leg'"):
+    with pytest.raises(WeightsError, match="does not exist; train it with 'softgym fit --config tetrapod_leg'"):
         LearnedLeg(tmp_path)
     (tmp_path / "model.safetensors").write_bytes(b"x")
     (tmp_path / "model.json").write_text('{"format": 1, "part": "wing"}')

@@ -157,7 +157,7 @@ class Superelement(Parts):
             hessian: of the function, shape (6, 6).
         """
         flat = self.strain_slopes(x)
-        return flat.T @ hessian @ flat + np.kron(np.tensordot(gradient, self._forms[0], 1), np.eye(3))
+        return flat.T @ hessian @ flat + np.kron(np.tensordot(gradient, self.forms[0], 1), np.eye(3))
 
     def energies(self, y: np.ndarray) -> Energies | None:
         if not (np.abs(y[0, 3:]) <= LARGEST_ROTATION).all():

@@ -9,7 +9,7 @@ without weight changes them.
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -104,6 +104,8 @@ class Parts(ElementBlock):
 
     Attributes:
         port_rows: rows of the frames of both ports of each part, shape (k, 8).
+        forms: ``A`` of each part over these rows, shape (k, m, 8, 8).
+        linear: ``B`` likewise, shape (k, m, 8, 3).
     """
 
     volume = 0.0
@@ -134,8 +136,8 @@ class Parts(ElementBlock):
                 maps[k, slot, slot + 1 : slot + 4] = directors @ (port.middle - nodes[port.frame])
                 maps[k, slot + 1 : slot + 4, slot + 1 : slot + 4] = (directors @ port.axes).T
         back = maps.transpose(0, 2, 1)
-        self._forms = np.ascontiguousarray(back[:, None] @ forms @ maps[:, None])
-        self._linear = np.ascontiguousarray(back[:, None] @ linear)
+        self.forms = np.ascontiguousarray(back[:, None] @ forms @ maps[:, None])
+        self.linear = np.ascontiguousarray(back[:, None] @ linear)
         self._inertia = back @ inertia @ maps
         # The axes of each port share the inertia of its own motion; middles move by their weights in every point.
         middles = np.zeros(ROWS)
@@ -156,14 +158,14 @@ class Parts(ElementBlock):
 
     def slopes(self, x: np.ndarray) -> np.ndarray:
         """Return the derivatives (k, m, 8, 3) of the coordinates by `port_rows` at rows ``x`` (n, 3)."""
-        slopes = np.empty((*self._forms.shape[:3], 3))
-        _slopes(self._forms, self._linear, x[self.port_rows], slopes)
+        slopes = np.empty((*self.forms.shape[:3], 3))
+        _slopes(self.forms, self.linear, x[self.port_rows], slopes)
         return slopes
 
     def coordinates(self, x: np.ndarray, slopes: np.ndarray | None = None) -> np.ndarray:
         """Return the coordinates (k, m) at rows ``x`` (n, 3), with their `slopes` if they are known."""
         slopes = self.slopes(x) if slopes is None else slopes
-        return 0.5 * np.einsum("kiad,kad->ki", slopes + self._linear, x[self.port_rows]) - self._rest
+        return 0.5 * np.einsum("kiad,kad->ki", slopes + self.linear, x[self.port_rows]) - self._rest
 
     def stencils(self) -> list[tuple[np.ndarray, np.ndarray]]:
         return [lower_pairs((3 * self.port_rows[:, :, None] + np.arange(3)).reshape(-1, 3 * ROWS))]
@@ -190,7 +192,7 @@ class Parts(ElementBlock):
         """Add forces and tangents for derivatives of energies by the coordinates, (k, m) and (k, m, m)."""
         np.add.at(gradient, self.port_rows, np.einsum("ki,kiad->kad", force, slopes))
         if values is not None and scatter is not None:
-            _add_tangent(self._forms, slopes, force, stiffness, scatter[0], values)
+            _add_tangent(self.forms, slopes, force, stiffness, scatter[0], values)
 
     @abstractmethod
     def viscosity(self, start: np.ndarray) -> np.ndarray:
@@ -264,6 +266,34 @@ def _pose_forms(length: float, weight: np.ndarray) -> tuple[np.ndarray, np.ndarr
             forms[3 + 3 * i + j, 1 + i, 5 + j] = 1.0
         linear[12 + i, 1 + i] = weight
     return forms + forms.transpose(0, 2, 1), linear
+
+
+def tip_stiffness(y: Any, gradient: Any, hessian: Any) -> tuple[Any, Any]:
+    """Return the stiffness of parts against motions of their far ports, see `PoseParts.tip_stiffness`.
+
+    Args:
+        y: poses, shape (k, 15); NumPy arrays or tensors.
+        gradient: of the energies, shape (k, 15).
+        hessian: of the energies, shape (k, 15, 15).
+    """
+    k, R = len(y), y[:, 3:12].reshape(-1, 3, 3)
+    new = np.zeros if isinstance(y, np.ndarray) else y.new_zeros
+    moves, turned = new((k, POSE, 6)), new((k, 3, 3, 3))
+    for i in range(3):
+        moves[:, i, i] = 1.0
+        # A spin w turns the far axes, the columns of R: dR = w x R.
+        j, m = (i + 1) % 3, (i + 2) % 3
+        turned[:, m, :, i], turned[:, j, :, i] = R[:, j], -R[:, m]
+    moves[:, 3:12, 3:] = turned.reshape(k, 9, 3)
+    stiffness = moves.swapaxes(1, 2) @ hessian @ moves
+    # The second derivative of a rotation: (w w^T - |w|^2) R.
+    G = gradient[:, 3:12].reshape(-1, 3, 3) @ R.swapaxes(1, 2)
+    stiffness[:, 3:, 3:] += 0.5 * (G + G.swapaxes(1, 2))
+    for i in range(3):
+        stiffness[:, 3 + i, 3 + i] -= G[:, 0, 0] + G[:, 1, 1] + G[:, 2, 2]
+    back = 1.0 * moves.swapaxes(1, 2)
+    back[:, 3:] *= 0.5
+    return 0.5 * (stiffness + stiffness.swapaxes(1, 2)), back
 
 
 class PoseParts(Parts):
@@ -341,23 +371,7 @@ class PoseParts(Parts):
         """
         found = self.energies(y)
         assert found is not None
-        k, R = len(y), y[:, 3:12].reshape(-1, 3, 3)
-        moves = np.zeros((k, POSE, 6))
-        moves[:, [0, 1, 2], [0, 1, 2]] = 1.0
-        # A spin w turns the far axes, the columns of R: dR = w x R.
-        turned = np.zeros((k, 3, 3, 3))
-        for i in range(3):
-            j, m = (i + 1) % 3, (i + 2) % 3
-            turned[:, m, :, i], turned[:, j, :, i] = R[:, j], -R[:, m]
-        moves[:, 3:12, 3:] = turned.reshape(k, 9, 3)
-        stiffness = moves.transpose(0, 2, 1) @ found.hessian @ moves
-        # The second derivative of a rotation: (w w^T - |w|^2) R.
-        G = found.gradient[:, 3:12].reshape(-1, 3, 3) @ R.transpose(0, 2, 1)
-        trace = np.trace(G, axis1=1, axis2=2)
-        stiffness[:, 3:, 3:] += 0.5 * (G + G.transpose(0, 2, 1)) - trace[:, None, None] * np.eye(3)
-        back = moves.transpose(0, 2, 1).copy()
-        back[:, 3:] *= 0.5
-        return 0.5 * (stiffness + stiffness.transpose(0, 2, 1)), back
+        return tip_stiffness(y, found.gradient, found.hessian)
 
     def possible_errors(self, x: np.ndarray, fields: np.ndarray) -> np.ndarray:
         """As `ElementBlock.possible_errors`: of wrenches on the far ports, equal in the metric in which parts learn.

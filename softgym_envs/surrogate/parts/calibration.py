@@ -14,11 +14,11 @@ from softgym_envs.mechanics.solvers.equilibrium import Equilibrium
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import Robot
 from softgym_envs.storage import read_json, write_json
+from softgym_envs.surrogate.calibration import conformal_quantile
 from softgym_envs.surrogate.data.strata import draw_commands
 from softgym_envs.surrogate.parts.trust import Judged, judge
 from softgym_envs.surrogate.parts.weights import LearnedLeg
 
-COVERAGE = 0.95
 INCREMENTS = 20
 """Increments in which a command is approached from rest: of several equilibria both models are to find the same."""
 STRATA = ("inside", "faces", "corners")
@@ -137,35 +137,28 @@ def _errors(found: CondensedModel, true: CondensedModel) -> tuple[float, float, 
     return float(np.linalg.norm(found.delta.e[:3] - true.delta.e[:3])), float(effort), held, jacobian
 
 
-def calibrate_parts(
-    folder: str | Path, robot: Robot, *, bodies: int, seed: int, states: int = 1
-) -> Mapping[str, Mapping[str, float]]:
+def calibrate_parts(folder: str | Path, robot: Robot, *, bodies: int, seed: int) -> Mapping[str, Mapping[str, float]]:
     """Calibrate how far bodies of parts may be off, and write the result to the card of the weights.
 
-    The errors of the parts are scaled so that the uncertainty covers `COVERAGE` of the errors of the effector inside
-    the design box; other strata are reported.
+    The errors of the parts are scaled so that the uncertainty covers 95 % of the errors of the effector, inside the
+    design box and at its corners; bodies at its faces are reported.
 
     Args:
         folder: of the weights.
         robot: on its mesh of finite elements.
         bodies: of each stratum.
         seed: of bodies and commands.
-        states: commands of each body; one, since each is approached from rest.
 
     Returns:
         What `Comparison.summary` says of each stratum.
     """
-    if states != 1:
-        raise ValueError(f"states = {states}: of bodies of learned parts, each has one command; allowed: 1")
-    folder = Path(folder)
-    found = compare(robot, LearnedLeg(folder), bodies=bodies, seed=seed)
-    sound = found.known & (found.stratum == "inside")
-    ratio = np.sort(found.error[sound] / found.uncertainty[sound])
-    rank = min(int(np.ceil((len(ratio) + 1) * COVERAGE)), len(ratio))
+    folder, part = Path(folder), LearnedLeg(folder)
+    found = compare(robot, part, bodies=bodies, seed=seed)
     path = folder / "model.json"
-    card = read_json(path)
-    part = LearnedLeg(folder)
-    trust = {"wrong": part.wrong * float(ratio[rank - 1]), "bodies": bodies, "seed": seed}
-    write_json(path, {**card, "trust": trust})
+    trust: dict[str, float] = {"bodies": bodies, "seed": seed}
+    for name, now in zip(("inside", "corners"), part.wrong, strict=True):
+        rows = found.known & (found.stratum == name)
+        trust[name] = now * conformal_quantile(found.error[rows] / found.uncertainty[rows])
+    write_json(path, {**read_json(path), "trust": trust})
     again = compare(robot, LearnedLeg(folder), bodies=bodies, seed=seed)
     return {stratum: again.summary(again.stratum == stratum) for stratum in STRATA}

@@ -7,11 +7,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from softgym_envs.designs import Design, DesignSpace
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.elements.beams import Beam
 from softgym_envs.mechanics.solvers.dynamics import Dynamics
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.tetrapod import MESHES, Tetrapod
+from softgym_envs.surrogate.data.sampling import pushed
 from softgym_envs.surrogate.parts.held_leg import HeldLeg
 from softgym_envs.surrogate.parts.leg import VARIABLES, LegScale
 
@@ -21,6 +23,12 @@ SHIFT, TURN, AS_FOUND = 0.02, 0.10, 0.3
 """How far poses are moved (over the length) and turned [rad] in the mean, and the share that stays as it was found."""
 TAUT = 5e-4
 """How far poses reach beyond the length of the leg: longer ones are drawn back to at most this."""
+
+
+def draw_body(space: DesignSpace, boundary: float, rng: np.random.Generator) -> Design:
+    """Return a random body; with the probability ``boundary`` some of its variables are at their bounds."""
+    unit = rng.random((1, len(space)))
+    return space.from_unit(2.0 * (pushed(unit, rng) if rng.random() < boundary else unit)[0] - 1.0)
 
 
 class Poses(NamedTuple):
@@ -43,18 +51,19 @@ class Poses(NamedTuple):
     down: np.ndarray
 
 
-def swing_poses(bodies: int, steps: int, seed: int) -> Poses:
+def swing_poses(bodies: int, steps: int, seed: int, boundary: float) -> Poses:
     """Return the end poses of the legs of random Tetrapods that swing between random commands.
 
     Args:
         bodies: number of random bodies; one without equilibrium at rest is passed over.
         steps: control steps of 50 ms for each.
         seed: of bodies and commands.
+        boundary: share of bodies at the boundary of the design box.
     """
     robot, rng = Tetrapod(mesh="accurate"), np.random.default_rng(seed)
     rows: list[tuple[np.ndarray, ...]] = []
     for body in range(bodies):
-        design = robot.design_space.sample(rng)
+        design = draw_body(robot.design_space, boundary, rng)
         goals = rng.uniform(robot.lower, robot.upper, (1 + steps // PATIENCE, 4)) * rng.choice(
             [0.4, 1.0], (1 + steps // PATIENCE, 1)
         )
@@ -104,7 +113,9 @@ class LegStates(NamedTuple):
     compliance: np.ndarray
 
 
-def held_states(poses: Poses, copies: int, seed: int, *, elements: int = MESHES["accurate"]) -> LegStates:
+def held_states(
+    poses: Poses, copies: int, seed: int, boundary: float, *, elements: int = MESHES["accurate"]
+) -> LegStates:
     """Return equilibria of legs held at poses: of their own dimensions and, every second copy, of others.
 
     A path is on one branch of equilibria until it is unstable: what comes after is left out.
@@ -113,6 +124,7 @@ def held_states(poses: Poses, copies: int, seed: int, *, elements: int = MESHES[
         poses: end poses; those of one leg in turn are followed as a path.
         copies: how many times each is used.
         seed: of dimensions and shifts.
+        boundary: share of other dimensions at the boundary of the design box.
         elements: of each leg.
     """
     space, rng = Tetrapod().design_space, np.random.default_rng(seed)
@@ -123,7 +135,7 @@ def held_states(poses: Poses, copies: int, seed: int, *, elements: int = MESHES[
         for copy in range(copies):
             values = poses.design[path[0]]
             if copy % 2:
-                drawn = space.sample(rng)
+                drawn = draw_body(space, boundary, rng)
                 values = np.array([drawn[name] for name in VARIABLES])
             scale = LegScale.of(dict(zip(VARIABLES, values, strict=True)))
             moved = 0.0 if rng.random() < AS_FOUND else 1.0

@@ -1,6 +1,6 @@
 """Numbers with first and second derivatives: the arithmetic of a formula gives its derivatives, exactly.
 
-`features` is written once and evaluated on `Jet` (with NumPy, for elements) or on tensors (in training and on a GPU).
+`features` is written once. It is evaluated on `Jet`, of NumPy arrays or of tensors, and in training on tensors alone.
 """
 
 from __future__ import annotations
@@ -10,6 +10,25 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+
+Array = Any
+"""A NumPy array or a tensor."""
+
+HALF_PI = 0.5 * math.pi
+
+
+def namespace(values: Array) -> Any:
+    """Return NumPy for its arrays, and torch for tensors."""
+    if isinstance(values, np.ndarray):
+        return np
+    import torch
+
+    return torch
+
+
+def zeros(like: Array, *shape: int) -> Array:
+    """Return zeros of a shape, of the kind of an array."""
+    return np.zeros(shape) if isinstance(like, np.ndarray) else like.new_zeros(shape)
 
 
 class Jet:
@@ -24,15 +43,19 @@ class Jet:
     __slots__ = ("first", "second", "value")
     __array_priority__ = 100.0  # NumPy arrays leave operations to jets
 
-    def __init__(self, value: np.ndarray, first: np.ndarray, second: np.ndarray | None = None) -> None:
+    def __init__(self, value: Array, first: Array, second: Array | None = None) -> None:
         self.value, self.first, self.second = value, first, second
 
     @classmethod
-    def coordinates(cls, y: np.ndarray) -> list[Jet]:
+    def coordinates(cls, y: Array) -> list[Jet]:
         """Return the coordinates (n, m) themselves, one jet for each of the m."""
-        n, m = y.shape
-        unit = np.eye(m)
-        return [cls(y[:, k], np.broadcast_to(unit[k], (n, m))) for k in range(m)]
+        m = y.shape[1]
+        firsts = zeros(y, m, *y.shape)
+        found = []
+        for k in range(m):
+            firsts[k, :, k] = 1.0
+            found.append(cls(y[:, k], firsts[k]))
+        return found
 
     def __add__(self, other: Any) -> Jet:
         if isinstance(other, Jet):
@@ -51,12 +74,10 @@ class Jet:
         return (-self) + other
 
     def __mul__(self, other: Any) -> Jet:
-        if not isinstance(other, Jet):
-            scale = np.asarray(other)
-            second = None if self.second is None else self.second * scale[..., None, None]
-            return Jet(self.value * scale, self.first * scale[..., None], second)
+        if not isinstance(other, Jet):  # a number
+            return Jet(self.value * other, self.first * other, None if self.second is None else self.second * other)
         mixed = self.first[:, :, None] * other.first[:, None, :]
-        second = mixed + mixed.transpose(0, 2, 1)
+        second = mixed + mixed.swapaxes(1, 2)
         if other.second is not None:
             second += self.value[:, None, None] * other.second
         if self.second is not None:
@@ -75,7 +96,7 @@ class Jet:
             return self * other.mapped(inverse, -(inverse**2), 2.0 * inverse**3)
         return self * (1.0 / other)
 
-    def mapped(self, value: np.ndarray, slope: np.ndarray, curvature: np.ndarray) -> Jet:
+    def mapped(self, value: Array, slope: Array, curvature: Array) -> Jet:
         """Return a function of this number from its values and its first two derivatives, each (n,)."""
         second = curvature[:, None, None] * (self.first[:, :, None] * self.first[:, None, :])
         if self.second is not None:
@@ -83,7 +104,7 @@ class Jet:
         return Jet(value, slope[:, None] * self.first, second)
 
 
-def _sum(one: np.ndarray | None, other: np.ndarray | None) -> np.ndarray | None:
+def _sum(one: Array | None, other: Array | None) -> Array | None:
     if one is None or other is None:
         return other if one is None else one
     return one + other
@@ -94,52 +115,60 @@ class JetFunctions:
 
     @staticmethod
     def sqrt(x: Jet) -> Jet:
-        root = np.sqrt(x.value)
+        root = x.value**0.5
         return x.mapped(root, 0.5 / root, -0.25 / (root * x.value))
 
     @staticmethod
     def log(x: Jet) -> Jet:
         inverse = 1.0 / x.value
-        return x.mapped(np.log(x.value), inverse, -(inverse**2))
+        return x.mapped(namespace(x.value).log(x.value), inverse, -(inverse**2))
 
     @staticmethod
     def cos(x: Jet) -> Jet:
-        c, s = np.cos(x.value), np.sin(x.value)
+        xp = namespace(x.value)
+        c, s = xp.cos(x.value), xp.sin(x.value)
         return x.mapped(c, -s, -c)
 
     @staticmethod
     def sin(x: Jet) -> Jet:
-        c, s = np.cos(x.value), np.sin(x.value)
+        xp = namespace(x.value)
+        c, s = xp.cos(x.value), xp.sin(x.value)
         return x.mapped(s, c, -s)
 
     @staticmethod
     def softplus(x: Jet) -> Jet:
         """``log(1 + exp(x))``."""
-        share = 0.5 * (1.0 + np.tanh(0.5 * x.value))
-        return x.mapped(np.logaddexp(0.0, x.value), share, share * (1.0 - share))
+        xp = namespace(x.value)
+        share = 0.5 * (1.0 + xp.tanh(0.5 * x.value))
+        value = xp.logaddexp(0.0 * x.value, x.value)
+        return x.mapped(value, share, share * (1.0 - share))
 
     @staticmethod
     def atan2(y: Jet, x: Jet) -> Jet:
         """Angle of the direction (x, y)."""
         square = x.value**2 + y.value**2
-        # The derivatives are those of the angle by y and x; only products of first derivatives have curvature.
-        a, b = x.value / square, -y.value / square
+        a, b = x.value / square, -y.value / square  # derivatives of the angle by y and x
         first = a[:, None] * y.first + b[:, None] * x.first
-        yy = 2.0 * a * b
-        xy = (y.value**2 - x.value**2) / square**2
+        same = 2.0 * a * b
+        crossed = (y.value**2 - x.value**2) / square**2
         mixed = y.first[:, :, None] * x.first[:, None, :]
-        second = yy[:, None, None] * (
-            y.first[:, :, None] * y.first[:, None, :] - x.first[:, :, None] * x.first[:, None, :]
-        ) + xy[:, None, None] * (mixed + mixed.transpose(0, 2, 1))
+        own = y.first[:, :, None] * y.first[:, None, :] - x.first[:, :, None] * x.first[:, None, :]
+        second = same[:, None, None] * own + crossed[:, None, None] * (mixed + mixed.swapaxes(1, 2))
         for scale, part in ((a, y.second), (b, x.second)):
             if part is not None:
                 second += scale[:, None, None] * part
-        return Jet(np.arctan2(y.value, x.value), first, second)
+        return Jet(namespace(x.value).arctan2(y.value, x.value), first, second)
 
 
-def columns(parts: Sequence[Jet | float | np.ndarray], n: int, m: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return values (n, k) and first derivatives (n, k, m) of k numbers, of which some may be constants."""
-    values, slopes = np.empty((n, len(parts))), np.zeros((n, len(parts), m))
+def columns(parts: Sequence[Any], y: Array) -> tuple[Array, Array]:
+    """Return values (n, k) and first derivatives (n, k, m) of k numbers, of which some may be constants.
+
+    Args:
+        parts: jets, and numbers or columns (n,) that do not depend on the coordinates.
+        y: the coordinates (n, m).
+    """
+    n, m = y.shape
+    values, slopes = zeros(y, n, len(parts)), zeros(y, n, len(parts), m)
     for k, part in enumerate(parts):
         if isinstance(part, Jet):
             values[:, k], slopes[:, k] = part.value, part.first
@@ -148,13 +177,11 @@ def columns(parts: Sequence[Jet | float | np.ndarray], n: int, m: int) -> tuple[
     return values, slopes
 
 
-def weighted_second(parts: Sequence[Any], weights: np.ndarray, m: int) -> np.ndarray:
+def weighted_second(parts: Sequence[Any], weights: Array, y: Array) -> Array:
     """Return the second derivatives (n, m, m) of the sum of k numbers with constant weights (n, k)."""
-    total = np.zeros((len(weights), m, m))
+    n, m = y.shape
+    total = zeros(y, n, m, m)
     for k, part in enumerate(parts):
         if isinstance(part, Jet) and part.second is not None:
             total += weights[:, k, None, None] * part.second
     return total
-
-
-HALF_PI = 0.5 * math.pi

@@ -41,12 +41,14 @@ class PartData(Config):
         bodies: random bodies whose legs' poses are used.
         steps: control steps of each.
         copies: how many legs are held at each pose: its own and, every second time, one of other dimensions.
+        boundary: share of bodies, and of other dimensions, at the boundary of the design box.
         seed: of bodies, commands, dimensions and shifts.
     """
 
-    bodies: int = Field(default=320, gt=1)
+    bodies: int = Field(default=400, gt=1)
     steps: int = Field(default=48, gt=0)
     copies: int = Field(default=4, gt=0)
+    boundary: float = Field(default=0.4, ge=0.0, le=1.0)
     seed: int = Field(default=0, ge=0)
 
 
@@ -60,7 +62,7 @@ class PartNetwork(TrainingOptions):
 
     width: int = Field(default=128, gt=0)
     depth: int = Field(default=3, gt=0)
-    steps: int = Field(default=6000, gt=0)
+    steps: int = Field(default=8000, gt=0)
     batch_size: int = Field(default=384, gt=0)
     learning_rate: float = Field(default=3e-3, gt=0)
 
@@ -88,8 +90,9 @@ def generate_part_data(config: PartConfig, folder: str | Path) -> LegStates:
         with np.load(path, allow_pickle=False) as kept:
             if str(kept["plan"]) == plan:
                 return LegStates(*(kept[name] for name in LegStates._fields))
-    poses = swing_poses(config.data.bodies, config.data.steps, config.data.seed)
-    found = held_states(poses, config.data.copies, config.data.seed)
+    plan_of = config.data
+    poses = swing_poses(plan_of.bodies, plan_of.steps, plan_of.seed, plan_of.boundary)
+    found = held_states(poses, plan_of.copies, plan_of.seed, plan_of.boundary)
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as stream:
         np.savez_compressed(stream, allow_pickle=False, plan=np.array(plan), **found._asdict())

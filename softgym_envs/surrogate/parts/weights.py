@@ -13,13 +13,14 @@ import numpy as np
 from softgym_envs.errors import DataError, WeightsError
 from softgym_envs.robots.tetrapod import Tetrapod
 from softgym_envs.storage import read_json
+from softgym_envs.surrogate.domain import EDGE
 from softgym_envs.surrogate.parts.energy import LegFunction
 from softgym_envs.surrogate.parts.leg import VARIABLES, LegScale
 from softgym_envs.surrogate.parts.pose import PLACE, TURN
 from softgym_envs.surrogate.weight_files import check_hash, write_weights
 
 FORMAT = 1
-SHIPPED = Path(__file__).parent.parent / "weights" / "tetrapod_leg"
+SHIPPED = Path(__file__).parent / "tetrapod_leg"
 
 
 @dataclass(frozen=True)
@@ -145,21 +146,40 @@ class LearnedLeg:
 
     Attributes:
         card: of the weights.
-        wrong: how far tips may move under the errors of their wrenches, over the length.
+        tensors: the weights, by the names of `LegNetwork`.
+        domain: poses and loads that it has learned.
+        wrong: see `wrong_of`, inside the box of dimensions and at its corners.
 
     Raises:
         WeightsError: as `read_leg`.
     """
 
+    domain = LegDomain()
+
     def __init__(self, folder: str | Path | None = None) -> None:
-        self.card, self._tensors = read_leg(folder)
-        self.wrong = float(self.card.get("trust", {}).get("wrong", self.card["test"]["moved_p95"]))
+        self.card, self.tensors = read_leg(folder)
+        usual = float(self.card["test"]["moved_p95"])
+        trust = self.card.get("trust", {})
+        self.wrong = float(trust.get("inside", usual)), float(trust.get("corners", usual))
+        bounds = [self.card["design_variables"][name] for name in VARIABLES]
+        self._low, self._high = (np.array([bound[k] for bound in bounds], dtype=float) for k in (0, 1))
+
+    def wrong_of(self, design: Mapping[str, float]) -> float:
+        """Return how far the tips of a body's legs may move under the errors of their wrenches, over the length.
+
+        The logarithm is linear in the share of dimensions at their bounds, as in `softgym_envs.surrogate.domain`.
+        """
+        values = np.array([design[name] for name in VARIABLES])
+        away = np.abs(2.0 * values - self._low - self._high) / (self._high - self._low)
+        share = float(np.clip((away - 1.0) / EDGE + 1.0, 0.0, 1.0).mean())
+        inside, corners = self.wrong
+        return float(inside ** (1.0 - share) * corners**share)
 
     def __call__(self, design: Mapping[str, float], gravity: np.ndarray) -> dict[str, Any]:
         """Return the options of `PoseParts` for the legs of a body."""
         scale = LegScale.of(design)
         return {
-            "energy": LegEnergy(self._tensors, scale.shape, self.wrong),
+            "energy": LegEnergy(self.tensors, scale.shape, self.wrong_of(design)),
             "length": float(scale.length),
             "scale": float(scale.energy),
             "weight": float(scale.weight) * gravity,
