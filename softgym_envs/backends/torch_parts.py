@@ -16,6 +16,7 @@ from torch import Tensor
 from softgym_envs.backends.time_steps import TimeSteps
 from softgym_envs.backends.torch_batch import Bodies
 from softgym_envs.mechanics.constraints.point import Point
+from softgym_envs.mechanics.constraints.servo import Servo
 from softgym_envs.mechanics.elements.parts import PoseParts, tip_stiffness
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
@@ -120,9 +121,9 @@ class TorchParts:
         effector = np.zeros(n)
         effector[point.embedding.node_ids[0]] = point.embedding.weights[0]
         self._effector = self._put(effector)
-        rows = [constraint.row for constraint in model.constraints["a"]]
-        self._servo_rows = self._index(rows)
-        self._directions = self._put([constraint.directions for constraint in model.constraints["a"]])
+        servos = [c for c in model.constraints["a"] if isinstance(c, Servo)]
+        self._servo_rows = self._index([servo.row for servo in servos])
+        self._directions = self._put([servo.directions for servo in servos])
 
     def _selection(self, numbers: np.ndarray) -> Tensor:
         """Return the matrix (f, 3, N) that picks the equations of frames; fixed components are zero."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -117,7 +118,8 @@ def compare(robot: Robot, part: LearnedLeg, *, bodies: int, seed: int, strata: t
                 continue
             judged = judge(statics, robot, found.x, found.effort, held)
             rows.append((stratum, command, *_errors(found.condensed, true), *_verdict(judged)))
-    return Comparison(*(np.array(column) for column in zip(*rows, strict=True)), lost, failed)
+    columns: list[Any] = [np.array(column) for column in zip(*rows, strict=True)]
+    return Comparison(*columns, lost=lost, failed=failed)
 
 
 def _verdict(judged: Judged) -> tuple[float, float, bool, bool]:
