@@ -119,7 +119,7 @@ def compare(robot: Robot, part: LearnedLeg, *, bodies: int, seed: int, strata: t
             judged = judge(statics, robot, found.x, found.effort, held)
             rows.append((stratum, command, *_errors(found.condensed, true), *_verdict(judged)))
     columns: list[Any] = [np.array(column) for column in zip(*rows, strict=True)]
-    return Comparison(*columns, lost=lost, failed=failed)
+    return Comparison(*columns, *(lost, failed))
 
 
 def _verdict(judged: Judged) -> tuple[float, float, bool, bool]:
