@@ -76,6 +76,7 @@ def list_(as_json: bool) -> None:
 @click.option("--record", type=options.PATH, help="Write a rerun recording (.rrd) to this file.")
 @click.option("--video", type=options.PATH, help="Write a film (.mp4, .gif or .webp) to this file.")
 @click.option("--paraview", type=options.PATH, help="Write a time series for ParaView to this folder.")
+@click.option("--glb", type=options.PATH, help="Write an animation for Blender and browsers (.glb) to this file.")
 def rollout(
     environment: str,
     agent: str,
@@ -85,16 +86,20 @@ def rollout(
     record: Path | None,
     video: Path | None,
     paraview: Path | None,
+    glb: Path | None,
 ) -> None:
     """Run one episode and print its result."""
     import softgym_envs  # noqa: F401 - registers the IDs
     from softgym_envs.agents.evaluation import check_agent, make_agent
     from softgym_envs.surrogate.domain import distrust_text
+    from softgym_envs.viewer.gltf import GlbWriter
     from softgym_envs.viewer.paraview import ParaviewWriter
     from softgym_envs.viewer.recording import Filmed, Watcher, recorder_of, watch_rollout
 
     if record is not None and record.suffix != ".rrd":
         raise ConfigError(f"recording '{record}' must end with .rrd; --video writes films")
+    if glb is not None and glb.suffix != ".glb":
+        raise ConfigError(f"animation '{glb}' must end with .glb")
     if video is not None:
         from softgym_envs.viewer.video import check_video, write_video
 
@@ -110,9 +115,11 @@ def rollout(
         watchers: list[Watcher] = []
         if record is not None:
             watchers.append(open_files.enter_context(recorder_of(env, record)))
+        robot = env.unwrapped.robot  # type: ignore[attr-defined]
         if paraview is not None:
-            robot = env.unwrapped.robot  # type: ignore[attr-defined]
             watchers.append(open_files.enter_context(ParaviewWriter(robot, paraview)))
+        if glb is not None:
+            watchers.append(open_files.enter_context(GlbWriter(robot, glb)))
         if video is not None:
             watchers.append(Filmed(env, frames))
         summary = watch_rollout(env, act, watchers, seed=seed)
@@ -133,6 +140,8 @@ def rollout(
         click.echo(f"wrote {record}; open it with 'softgym view {record}'")
     if paraview is not None:
         click.echo(f"wrote {paraview}; open its .pvd files with ParaView")
+    if glb is not None:
+        click.echo(f"wrote {glb}")
     env.close()
 
 

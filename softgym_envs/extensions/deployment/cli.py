@@ -146,21 +146,25 @@ def export(
     moulds: Path | None,
     joints: int,
 ) -> None:
-    """Write a body to STEP, STL or MuJoCo files, or the moulds to cast it in.
+    """Write a body to STEP, STL, glTF or MuJoCo files, or the moulds to cast it in.
 
-    FILES end with .step or .stl, in millimetres, or with .xml: a chain of rigid links for MuJoCo, in metres.
+    FILES end with .step or .stl, in millimetres, or, in metres, with .glb for Blender and browsers or .xml: a chain of
+    rigid links for MuJoCo.
     """
     from softgym_envs.extensions.deployment.cad import export_body
     from softgym_envs.extensions.deployment.mjcf import export_mjcf
     from softgym_envs.extensions.deployment.moulds import export_moulds
+    from softgym_envs.viewer.gltf import write_glb
 
     if not files and moulds is None:
-        raise ConfigError("nothing to write: pass a file ending with .step, .stl or .xml, or a folder with --moulds")
+        raise ConfigError("nothing to write: pass a file ending with .step, .stl, .glb, .xml, or a folder with --moulds")
     body = options.robot_of(robot, options_)
     chosen = options.design_of(design)
     for file in files:
         if file.suffix == ".xml":
             click.echo(f"wrote {export_mjcf(body, file, chosen, joints=joints)} (metres)")
+        elif file.suffix == ".glb":
+            click.echo(f"wrote {write_glb(body, file, chosen)} (metres)")
         else:
             click.echo(f"wrote {export_body(body, file, chosen)} (millimetres)")
     for path in export_moulds(body, moulds, chosen) if moulds is not None else ():
