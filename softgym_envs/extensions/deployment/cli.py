@@ -157,7 +157,7 @@ def export(
     from softgym_envs.viewer.gltf import write_glb
 
     if not files and moulds is None:
-        raise ConfigError("nothing to write: pass a file ending with .step, .stl, .glb, .xml, or a folder with --moulds")
+        raise ConfigError("nothing to write: pass a file ending with .step, .stl, .glb or .xml, or --moulds FOLDER")
     body = options.robot_of(robot, options_)
     chosen = options.design_of(design)
     for file in files:
