@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from softgym_envs.cli import options
-from softgym_envs.cli.environments import AGENT_HELP
+from softgym_envs.cli.environments import AGENT_HELP, environment_of_agents
 from softgym_envs.errors import ConfigError
 from softgym_envs.wording import counted
 
@@ -47,7 +47,8 @@ def train(config: Path, folder: Path, initial: Path | None, quiet: bool, overrid
 
 
 @click.command()
-@options.config("agents")
+@click.option("--environment", help="An ID, in place of --config.", shell_complete=options.complete_environment)
+@options.environment
 @click.option(
     "--agent", "agents", multiple=True, default=("qp", "random"), show_default=True, help=AGENT_HELP + " Repeatable."
 )
@@ -64,7 +65,7 @@ def train(config: Path, folder: Path, initial: Path | None, quiet: bool, overrid
 @options.as_json
 @options.overrides
 def evaluate(
-    config: Path,
+    environment: str | None,
     agents: tuple[str, ...],
     backends: tuple[str, ...],
     design: tuple[str, ...],
@@ -74,11 +75,14 @@ def evaluate(
     output: Path | None,
     as_json: bool,
     overrides: tuple[str, ...],
+    **given: Any,
 ) -> None:
     """Evaluate agents on the same unseen goals.
 
-    --config is the one that the policies were trained with. If it draws bodies (sample_design), each goal has a drawn
-    body of its own, as in training, and the environment's own body is evaluated next; --design replaces both.
+    --config is the one that the policies were trained with, and KEY=VALUE changes it; --environment or --robot name
+    another environment. Without any of them it is that of the first policy. If it draws bodies (sample_design), each
+    goal has a drawn body of its own, as in training, and the environment's own body is evaluated next; --design
+    replaces both.
     """
     from softgym_envs.agents.baselines import BASELINES
     from softgym_envs.agents.config import TrainConfig
@@ -89,7 +93,13 @@ def evaluate(
     from softgym_envs.runs import provenance
     from softgym_envs.storage import write_json
 
-    environment = load_config(config, TrainConfig, overrides).environment
+    config, others = given["config"], {**given, "config": None, "id": environment}
+    if config is not None and not any(others.values()):
+        wanted = load_config(config, TrainConfig, overrides).environment
+    elif overrides:
+        raise ConfigError(f"'{overrides[0]}' changes a configuration: it needs --config, and no other environment")
+    else:
+        wanted = environment_of_agents("evaluate", agents, None, id=environment, **given)
     chosen = options.design_of(design) or None
     if goals < 1:
         raise ConfigError(f"--goals {goals} must be at least 1")
@@ -102,30 +112,30 @@ def evaluate(
     for agent in agents:  # reject an invalid policy before any evaluation
         check_agent(agent)
         if agent not in BASELINES:
-            Policy(agent).check_environment(environment)
-    single = sample_goals(environment.model_copy(update={"sample_design": False}), goals, seed, chosen)
+            Policy(agent).check_environment(wanted)
+    single = sample_goals(wanted.model_copy(update={"sample_design": False}), goals, seed, chosen)
     # What the results are of: its name and its heading, the bodies and their goals.
     parts: list[tuple[str, str, Bodies, np.ndarray]] = [("one", "", chosen, single)]
     drawn = None
-    if environment.sample_design and chosen is None:
-        drawn, points = evaluation_set(environment, goals, seed)
+    if wanted.sample_design and chosen is None:
+        drawn, points = evaluation_set(wanted, goals, seed)
         heading = f"{counted(goals, 'drawn body')}, one for each goal (seed {seed}):"
         parts = [("drawn", heading, drawn, points), ("own", "the environment's own body:", None, single)]
-    shown = environment.task_class.distance_scale.text
+    shown = wanted.task_class.distance_scale.text
     results: list[dict[str, Any]] = []
     say = partial(click.echo, err=as_json)  # stdout is for the JSON
     say(f"{'agent':34s} {'backend':10s} {'success':>8s} {'mean':>11s} {'worst':>11s} {'return':>8s}")
     for bodies, heading, designs, points in parts:
         if heading:
             say(heading)
-        for backend in backends or (environment.backend,):
+        for backend in backends or (wanted.backend,):
             for agent in agents:
-                outcome = run(agent, environment.on(backend), points, design=designs, seed=seed, workers=workers)
+                outcome = run(agent, wanted.on(backend), points, design=designs, seed=seed, workers=workers)
                 results.append({"agent": agent, "backend": backend, "bodies": bodies, **outcome.to_json()})
                 distances = (f"{shown(value, 3):>11s}" for value in (outcome.mean_distance, outcome.worst_distance))
                 rate, total = f"{outcome.success_rate:8.1%}", f"{outcome.mean_return:8.2f}"
                 say(f"{agent[-34:]:34s} {backend:10s} {rate} {' '.join(distances)} {total}")
-    inputs = {"environment": environment.model_dump(mode="json"), "goals": goals, "seed": seed, "design": chosen}
+    inputs = {"environment": wanted.model_dump(mode="json"), "goals": goals, "seed": seed, "design": chosen}
     document = {**inputs, "drawn_designs": drawn and [dict(body) for body in drawn], **provenance(), "results": results}
     if as_json:
         click.echo(json.dumps(document))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import importlib
 import json
 import operator
 import os
@@ -27,19 +28,83 @@ AGENT_HELP = (
 )
 
 
-def environment_of_agent(id: str, agent: str, backend: str | None, verb: str) -> EnvironmentConfig:
-    """Return the environment for an agent: a policy needs the same observations and actions as in training."""
-    from softgym_envs.agents.baselines import BASELINES
-    from softgym_envs.agents.config import EnvironmentConfig
-    from softgym_envs.agents.policy import Policy
-    from softgym_envs.config import check_config
+def environment_of_agents(
+    verb: str,
+    agents: tuple[str, ...],
+    backend: str | None,
+    *,
+    id: str | None = None,
+    config: Path | None = None,
+    robot: str | None = None,
+    task: str | None = None,
+    options_: tuple[str, ...] = (),
+    task_options: tuple[str, ...] = (),
+    weights: Path | None = None,
+) -> EnvironmentConfig:
+    """Return the environment that a command names for its agents, by default that of the first policy among them.
 
-    policy = None if agent in BASELINES else Policy(agent)
-    trained = {} if policy is None else policy.environment.model_dump()
-    config = check_config(EnvironmentConfig, {**trained, "id": id}, verb)
-    if policy is not None:
-        policy.check_environment(config)
-    return config if backend is None else config.on(backend)
+    A policy needs the same observations and actions as in training.
+
+    Args:
+        verb: for messages.
+        agents: names, or files of policies.
+        backend: its backend, if not the default.
+        id: an ID, also ``module:ID`` as for Gymnasium: the module that registers it is imported.
+        config: configuration of a training, in place of the ID.
+        robot: a robot, in place of the ID.
+        task: task of the robot.
+        options_: options of the robot, ``name=value``.
+        task_options: options of the task.
+        weights: folder of surrogate weights.
+
+    Raises:
+        ConfigError: if the command names several environments, or none.
+    """
+    from softgym_envs.agents.baselines import BASELINES
+    from softgym_envs.agents.config import EnvironmentConfig, TrainConfig
+    from softgym_envs.agents.policy import Policy
+    from softgym_envs.config import check_config, load_config
+
+    policies = [Policy(agent) for agent in agents if agent not in BASELINES]
+    data: dict[str, Any] = policies[0].environment.model_dump() if policies else {}
+    given = {"ENVIRONMENT": id, "--config": config, "--robot": robot}
+    named = [name for name, value in given.items() if value is not None]
+    if len(named) > 1:
+        raise ConfigError(f"{verb} takes one environment, got {' and '.join(named)}")
+    if not named and not policies:
+        raise ConfigError(
+            f"{verb} needs an ENVIRONMENT (softgym list), --robot my_module:MyRobot, --config or a policy as --agent"
+        )
+    if task is not None and robot is None:
+        raise ConfigError(f"--task {task} needs --robot: the ID of an environment has its own task")
+    if config is not None:
+        data = load_config(config, TrainConfig).environment.model_dump()
+    elif id is not None:
+        data |= {"id": _registered(id), "robot": None, "task": None}
+    elif robot is not None:
+        data |= {"id": None, "robot": robot, "task": task or data.get("task") or "reach"}
+    for key, option, pairs in (("robot_options", "option", options_), ("task_options", "task-option", task_options)):
+        if pairs:
+            data[key] = {**data.get(key, {}), **options.values_of(option, pairs)}
+    if weights is not None:
+        data["backend_options"] = {**data.get("backend_options", {}), "weights": str(weights)}
+    found = check_config(EnvironmentConfig, data, verb)
+    for policy in policies:
+        policy.check_environment(found)
+    return found if backend is None else found.on(backend)
+
+
+def _registered(id: str) -> str:
+    """Return an ID; ``module:ID`` imports the module, which may be in the current folder."""
+    module, colon, name = id.rpartition(":")
+    if not colon:
+        return id
+    sys.path.append(os.getcwd())
+    try:
+        importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        raise ConfigError(f"environment '{id}': module '{module}' cannot be imported: {error}") from None
+    return name
 
 
 @click.command("list")
@@ -68,7 +133,8 @@ def list_(as_json: bool) -> None:
 
 
 @click.command()
-@click.argument("environment", shell_complete=options.complete_environment)
+@click.argument("environment", required=False, shell_complete=options.complete_environment)
+@options.environment
 @click.option("--agent", default="qp", show_default=True, help=AGENT_HELP)
 @click.option("--backend", help="surrogate, hybrid or fem (default: the environment's).")
 @options.design
@@ -78,7 +144,7 @@ def list_(as_json: bool) -> None:
 @click.option("--paraview", type=options.PATH, help="Write a time series for ParaView to this folder.")
 @click.option("--glb", type=options.PATH, help="Write an animation for Blender and browsers (.glb) to this file.")
 def rollout(
-    environment: str,
+    environment: str | None,
     agent: str,
     backend: str | None,
     design: tuple[str, ...],
@@ -87,8 +153,13 @@ def rollout(
     video: Path | None,
     paraview: Path | None,
     glb: Path | None,
+    **chosen: Any,
 ) -> None:
-    """Run one episode and print its result."""
+    """Run one episode and print its result.
+
+    ENVIRONMENT is an ID (softgym list), or module:ID as for Gymnasium. Without one, --robot, --config or the policy of
+    --agent says which environment it is.
+    """
     import softgym_envs  # noqa: F401 - registers the IDs
     from softgym_envs.agents.evaluation import check_agent, make_agent
     from softgym_envs.surrogate.domain import distrust_text
@@ -104,12 +175,12 @@ def rollout(
         from softgym_envs.viewer.video import check_video, write_video
 
         check_video(video)  # before the work begins
-    chosen = options.design_of(design)
+    body = options.design_of(design)
     check_agent(agent)
-    config = environment_of_agent(environment, agent, backend, "rollout")
+    config = environment_of_agents("rollout", (agent,), backend, id=environment, **chosen)
     act = make_agent(agent, seed)
     drawn = {"render_mode": "rgb_array"} if video is not None else {}
-    env = config.make(**({"design": chosen} if chosen else {}), **drawn)
+    env = config.make(**({"design": body} if body else {}), **drawn)
     frames: list[Any] = []
     with contextlib.ExitStack() as open_files:
         watchers: list[Watcher] = []
@@ -125,7 +196,7 @@ def rollout(
         summary = watch_rollout(env, act, watchers, seed=seed)
     total, step, distrust_codes = summary["return"], summary["steps"], summary["distrust_codes"]
     info = {"distance": summary["final_distance"], "is_success": summary["success"]}
-    click.echo(f"{environment} on {config.backend}, agent {agent}: {counted(step, 'step')}, return {total:.2f}")
+    click.echo(f"{config.title} on {config.backend}, agent {agent}: {counted(step, 'step')}, return {total:.2f}")
     scale = config.task_class.distance_scale
     click.echo(f"final {scale.name} {scale.text(info['distance'], 3)}, success {info['is_success']}")
     if distrusted := [distrust for distrust in distrust_codes if distrust]:
@@ -146,25 +217,25 @@ def rollout(
 
 
 @click.command()
-@click.argument("environment")
-@click.argument("name")
+@click.argument("names", nargs=-1, metavar="[ENVIRONMENT] NAME")
+@options.environment
 @click.option("--agent", default="qp", show_default=True, help=AGENT_HELP)
 @click.option("--backend", help="surrogate, hybrid or fem (default: the environment's).")
 @options.design
 @click.option("--episodes", default=100, show_default=True, help="Number of episodes.")
 @click.option("--seed", default=0, show_default=True, help="Seed of the first episode; the next ones add 1 each.")
 def record(
-    environment: str,
-    name: str,
+    names: tuple[str, ...],
     agent: str,
     backend: str | None,
     design: tuple[str, ...],
     episodes: int,
     seed: int,
+    **chosen: Any,
 ) -> None:
     """Record episodes as a Minari dataset, for offline learning.
 
-    NAME is the name of the dataset, such as softgym/finger-reach/qp-v0.
+    NAME is the name of the dataset, such as softgym/finger-reach/qp-v0. ENVIRONMENT as for rollout.
     """
     import softgym_envs  # noqa: F401 - registers the IDs
     from softgym_envs.agents.evaluation import check_agent
@@ -172,10 +243,13 @@ def record(
 
     if episodes < 1:
         raise ConfigError(f"--episodes {episodes} must be at least 1")
+    if not 1 <= len(names) <= 2:
+        raise ConfigError(f"record takes [ENVIRONMENT] NAME, got {' '.join(names) or 'nothing'}")
     check_agent(agent)
-    config = environment_of_agent(environment, agent, backend, "record")
-    chosen = options.design_of(design) or None
-    dataset = record_episodes(name, agent, config, episodes=episodes, design=chosen, seed=seed)
+    id, name = names if len(names) == 2 else (None, names[0])
+    config = environment_of_agents("record", (agent,), backend, id=id, **chosen)
+    body = options.design_of(design) or None
+    dataset = record_episodes(name, agent, config, episodes=episodes, design=body, seed=seed)
     episodes_text, steps_text = counted(dataset.total_episodes, "episode"), counted(dataset.total_steps, "step")
     click.echo(f"wrote {episodes_text}, {steps_text}: minari.load_dataset('{name}')")
 

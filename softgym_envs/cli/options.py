@@ -88,6 +88,31 @@ robot_option = click.option(
 )
 
 
+def environment(command: Callable) -> Callable:
+    """Add the options that name an environment in place of its ID; `softgym_envs.cli.environments` reads them."""
+    for option in (
+        click.option("--weights", type=PATH, help="Folder of surrogate weights (default: the shipped ones)."),
+        click.option("--task-option", "task_options", multiple=True, metavar="NAME=VALUE", help="Task option; repeat."),
+        robot_option,
+        click.option("--task", help="Task of --robot: a name or module:Class (default: reach)."),
+        click.option("--robot", help="In place of an ID: a robot, or module:Class.", shell_complete=complete_robot),
+        click.option("--config", type=ConfigFile("agents"), help="In place of an ID: the configuration of a training."),
+    ):
+        command = option(command)
+    return command
+
+
+def values_of(option: str, pairs: tuple[str, ...]) -> dict[str, Any]:
+    """Return the values of ``--option name=value``, read as in a configuration file.
+
+    Raises:
+        ConfigError: for a pair without a name or a value.
+    """
+    from softgym_envs.config import read_value
+
+    return {name: read_value(text) for name, text in _split(option, pairs)}
+
+
 def run_options(folder: str) -> Callable[[Callable], Callable]:
     """Add the options of a verb that runs a configuration: ``--config``, ``--quiet`` and overrides."""
     return lambda command: config(folder)(quiet(overrides(command)))
@@ -146,14 +171,13 @@ def robot_of(name: str, pairs: tuple[str, ...]) -> Robot:
         ConfigError: for the ID of an environment.
         ValueError: for an unknown robot or a wrong option.
     """
-    from softgym_envs.config import read_value
     from softgym_envs.envs.registration import ENVIRONMENTS
     from softgym_envs.robots.registry import make_robot
 
     if name in ENVIRONMENTS:
         raise ConfigError(f"'{name}' is an environment; its robot is '{ENVIRONMENTS[name].robot}'")
 
-    return make_robot(name, **{key: read_value(text) for key, text in _split("option", pairs)})
+    return make_robot(name, **values_of("option", pairs))
 
 
 def _split(option: str, pairs: tuple[str, ...]) -> Iterator[tuple[str, str]]:

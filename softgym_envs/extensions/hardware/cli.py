@@ -11,7 +11,7 @@ import click
 import numpy as np
 
 from softgym_envs.cli import options
-from softgym_envs.cli.environments import AGENT_HELP, environment_of_agent
+from softgym_envs.cli.environments import AGENT_HELP, environment_of_agents
 from softgym_envs.extras import require
 
 if TYPE_CHECKING:
@@ -109,7 +109,7 @@ def run(
     from softgym_envs.extensions.hardware.bench import Bench
 
     check_agent(agent)
-    wanted, act = environment_of_agent(environment, agent, "hardware", "hardware run"), make_agent(agent, seed)
+    wanted, act = environment_of_agents("hardware run", (agent,), "hardware", id=environment), make_agent(agent, seed)
     scale, results = wanted.task_class.distance_scale, []
     with _ports(_load(bench, overrides), emulate) as config, Bench.open(config) as found:
         given: dict[str, Any] = {"bench": found, "log": None if log is None else str(log), "trial": trial}
