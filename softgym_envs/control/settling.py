@@ -48,12 +48,12 @@ def settle(
     longest: float = 0.15,
     tolerance: float = 1e-3,
     equilibria: int = 8,
+    limit_efforts: bool = False,
 ) -> Settled:
     """Return where the inverse QP of a robot with one effector stays: it steps from equilibrium to equilibrium.
 
     The nearest equilibrium to the goal is returned, so a step that leads away is not taken, and the next one is half as
-    long. Neither the solver nor this controller keeps to the largest efforts of the actuators: compare ``effort`` with
-    them.
+    long. The solver does not keep to the largest efforts of the actuators: compare ``effort`` with them.
 
     Args:
         statics: solver of the body.
@@ -63,11 +63,13 @@ def settle(
         longest: largest step, relative to the ranges of the commands.
         tolerance: smallest step, likewise.
         equilibria: largest number of equilibria.
+        limit_efforts: whether the controller keeps to the largest efforts.
 
     Raises:
         ConvergenceError: if there is no equilibrium under the first command.
     """
     span = robot.upper - robot.lower
+    unlimited = {} if limit_efforts else {"min_effort": None, "max_effort": None}
     command = np.clip(start, robot.lower, robot.upper)
     best: tuple[Settled, Equilibrium] | None = None
     for count in range(1, equilibria + 1):
@@ -85,7 +87,7 @@ def settle(
             else:
                 longest *= 0.5
         found, state = best
-        controller = InverseQP.for_robot(robot, rates=longest * span, min_effort=None, max_effort=None)
+        controller = InverseQP.for_robot(robot, rates=longest * span, **unlimited)
         command = controller.solve(state.condensed, goal, found.command, state.slack)
         change = float((np.abs(command - found.command) / span).max())
         if change <= tolerance:

@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from softgym_envs.control import settling
 from softgym_envs.control.inverse_qp import InverseQP
 from softgym_envs.control.settling import nearest_next
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
+from softgym_envs.mechanics.solvers.statics import Statics
+from softgym_envs.robots.base import Robot
 
 if TYPE_CHECKING:
-    from softgym_envs.envs.env import SoftRobotEnv
     from softgym_envs.envs.vector_env import SoftRobotVectorEnv
 
 LONGEST = 0.1
@@ -58,7 +60,7 @@ def outcome(env: SoftRobotVectorEnv, goals: np.ndarray) -> np.ndarray:
 
 
 def settle_on_fem(
-    env: SoftRobotEnv, design: dict[str, float], goals: np.ndarray, commands: np.ndarray, longest: float
+    robot: Robot, design: dict[str, float], goals: np.ndarray, commands: np.ndarray, success: float, longest: float
 ) -> np.ndarray:
     """Return `outcome` of a body on finite elements, where the inverse QP comes to rest there.
 
@@ -68,31 +70,31 @@ def settle_on_fem(
     otherwise.
 
     Args:
-        env: an environment on finite elements, for any body; one is enough for many bodies.
+        robot: the robot.
         design: complete design [SI].
         goals: goals [m], shape (n, 3).
         commands: command that each goal begins with, shape (n, n_a).
+        success: distance within which a goal counts as reached [m].
         longest: see `settle`.
 
     Returns:
         Shape (n, 3); NaN where the body has no equilibrium.
     """
-    span = env.robot.upper - env.robot.lower
-    controller = InverseQP.for_robot(env.robot, goal_weights=env.task.axes, rates=longest * span)
     rows = np.full((len(goals), 3), np.nan)
     try:
-        env.backend.reset(design)
-        for place in nearest_next(commands / span):
-            goal, command = goals[place], commands[place]
-            state = env.backend.step(command)
-            for _ in range(MAX_STEPS):
-                following = controller.solve(state.condensed, goal, command, state.slack)
-                change, command = np.abs(following - command) / span, following
-                state = env.backend.step(command)
-                if change.max() < SETTLED:
-                    break
-            distance = float(np.linalg.norm((state.effector[:3] - goal) * env.task.axes))
-            rows[place] = distance, np.abs(state.effort).mean(), distance < env.task.success_distance
+        statics = Statics(robot.build(design))
+        for place in nearest_next(commands / (robot.upper - robot.lower)):
+            found = settling.settle(
+                statics,
+                robot,
+                goals[place],
+                commands[place],
+                longest=longest,
+                tolerance=SETTLED,
+                equilibria=MAX_STEPS,
+                limit_efforts=True,
+            )
+            rows[place] = found.distance, np.abs(found.effort).mean(), found.distance < success
     except (ConvergenceError, InfeasibleDesign):
         return np.full_like(rows, np.nan)
     return rows

@@ -30,7 +30,6 @@ from softgym_envs.surrogate.pretrained import ships_weights
 
 if TYPE_CHECKING:
     from softgym_envs.agents.config import EnvironmentConfig
-    from softgym_envs.envs.env import SoftRobotEnv
     from softgym_envs.envs.vector_env import SoftRobotVectorEnv
 
 CHUNK = 64
@@ -228,7 +227,6 @@ class Tabulation:
     longest: float = LONGEST
     goal_set: str = "search"
     goal_count: int | None = None
-    _solvers: dict[str | None, SoftRobotEnv] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         definition = self.problem.definition
@@ -304,11 +302,9 @@ class Tabulation:
         environment = self.environment(mesh)
         robot = self.problem.definition.model_copy(update={"environment": environment}).robot
         _, commands = self._at_rest(mesh if ships_weights(robot) else None, points)
-        if mesh not in self._solvers:
-            self._solvers[mesh] = cast("SoftRobotEnv", environment.on("fem").make(sample_design=False).unwrapped)
-        env = self._solvers[mesh]
+        success = environment.make_task(robot).success_distance
         rows = [
-            settle_on_fem(env, design, self.goals[:, 0], command, self.longest).mean(axis=0)
+            settle_on_fem(robot, design, self.goals[:, 0], command, success, self.longest).mean(axis=0)
             for design, command in zip(self.designs(points), commands, strict=True)
         ]
         return np.array(rows)
