@@ -18,7 +18,7 @@ from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.folder import SHARED_POLICY, StudyFolder
 from softgym_envs.codesign.phases.finalists import _trained_policy
 from softgym_envs.codesign.phases.shared_policy import joint_config
-from softgym_envs.codesign.phases.trial import training_config
+from softgym_envs.codesign.phases.trial import body_training
 from softgym_envs.codesign.records import Finalist, FinalistTest
 from softgym_envs.codesign.report.page import write_report
 from softgym_envs.codesign.report.statistics import kendall_tau
@@ -193,7 +193,7 @@ def test_a_training_of_a_finalist_with_other_steps_begins_again(study, monkeypat
     monkeypatch.setattr("softgym_envs.codesign.phases.finalists.train", train)
     for steps in (240, 90_000):  # the second one was begun by mistake
         RunFolder(place, TrainConfig, "a training").begin(
-            training_config(folder, finalist.design, {}).model_copy(update={"steps": steps})
+            body_training(folder, finalist.design, {}).model_copy(update={"steps": steps})
         )
         with pytest.raises(KeyboardInterrupt):
             _trained_policy(folder, finalist, 1)
