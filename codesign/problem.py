@@ -112,6 +112,11 @@ class StudyProblem(Config):
         """Names of the objectives that have a score, the one that decides first."""
         return self.objective, *self.secondary_objectives
 
+    @property
+    def titles(self) -> list[str]:
+        """Name of each of these, with its SI unit."""
+        return [self.objectives[name].stored_name for name in self.score_names]
+
     def signed(self, scores: Sequence[float]) -> list[float]:
         """Return the values [SI] behind scores, or scores of values: the sign of what is minimised differs."""
         return [self.objectives[name].score(score) for name, score in zip(self.score_names, scores, strict=True)]

@@ -67,19 +67,10 @@ def open_study(folder: StudyFolder, storage: StudyStorage | None = None, number:
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     storage = folder.open_storage() if storage is None else storage
-    sampler, pruner = make_sampler(folder.config.sampler, number), make_pruner(folder.config)
-    try:
-        study = optuna.load_study(study_name=storage.study, storage=storage.optuna, sampler=sampler, pruner=pruner)
-    except KeyError:
-        if storage.shared:
-            raise DataError(f"storage '{folder.config.storage}' has no study '{storage.study}'") from None
-        study = optuna.create_study(
-            study_name=storage.study,
-            storage=storage.optuna,
-            directions=folder.config.directions,
-            sampler=sampler,
-            pruner=pruner,
-        )
+    if storage.opened is None:
+        storage.opened = _load(folder.config, storage)
+    study = storage.opened
+    study.sampler, study.pruner = make_sampler(folder.config.sampler, number), make_pruner(folder.config)
     if study.metric_names is None:
         if not storage.shared:  # a shared one has them already
             study.set_user_attr("config", folder.config.model_dump(mode="json"))
@@ -88,11 +79,22 @@ def open_study(folder: StudyFolder, storage: StudyStorage | None = None, number:
     return study
 
 
+def _load(config: StudyConfig, storage: StudyStorage) -> optuna.Study:
+    import optuna
+
+    try:
+        return optuna.load_study(study_name=storage.study, storage=storage.optuna)
+    except KeyError:
+        if storage.shared:
+            raise DataError(f"storage '{config.storage}' has no study '{storage.study}'") from None
+        return optuna.create_study(study_name=storage.study, storage=storage.optuna, directions=config.directions)
+
+
 def _describe(study: optuna.Study, config: StudyConfig) -> None:
     """Tell Optuna's own tools what a study is about."""
     study.set_user_attr("environment", config.environment.id)
     study.set_user_attr("strategy", config.strategy)
-    name_metrics(study, [config.objectives[name].stored_name for name in config.score_names])
+    name_metrics(study, config.titles)
 
 
 def name_metrics(study: optuna.Study, names: Sequence[str]) -> None:

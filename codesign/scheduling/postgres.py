@@ -17,7 +17,7 @@ import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import partial
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from softgym_envs.codesign.metrics.metric import Direction
@@ -26,7 +26,7 @@ from softgym_envs.errors import ConfigError, SoftGymError
 
 if TYPE_CHECKING:
     import optuna
-    from sqlalchemy.engine import Connection, Engine
+    from sqlalchemy.engine import Connection
 
 T = TypeVar("T")
 
@@ -45,6 +45,9 @@ CONNECTION = {
     "tcp_user_timeout": 30_000,
     "options": "-c timezone=UTC -c tcp_keepalives_idle=10 -c tcp_keepalives_interval=5 -c tcp_keepalives_count=4",
 }
+
+SAVEPOINT = "optuna"
+"""Savepoint to which a failed write of Optuna goes back inside a transaction."""
 
 TABLES = """
 CREATE TABLE IF NOT EXISTS codesign_workers (worker text PRIMARY KEY, seen timestamptz NOT NULL);
@@ -114,11 +117,9 @@ class PostgresStorage(SharedStorage):
         self.study = study
         self.grace = grace
         self.patience = patience
-        self._url = sql.engine.make_url(address).set(drivername="postgresql+psycopg").render_as_string()
-        # Workers hold no connection while they train: there may be hundreds.
-        self._options = {"poolclass": sql.NullPool, "connect_args": CONNECTION}
-        self._engine = sql.create_engine(self._url, **self._options)
-        self._cache: optuna.storages.BaseStorage | None = None
+        self._url = sql.engine.make_url(address).set(drivername="postgresql+psycopg")
+        self._held: Any = None  # connection of the present transaction
+        self._engine = sql.create_engine(self._url, **self._options(self._connect))
         try:
             self._storage = self.patiently(self._open) if wait else self._open()
         except (sql.exc.SQLAlchemyError, OptunaError, RuntimeError) as error:
@@ -131,17 +132,24 @@ class PostgresStorage(SharedStorage):
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         with self._engine.begin() as connection:  # two machines may find an empty database at the same time
             self._lock(connection, "tables")
-            storage = optuna.storages.RDBStorage(self._url, engine_kwargs=self._options)
+            shared = self._options(lambda: self._connect() if self._held is None else self._held)
+            storage = optuna.storages.RDBStorage(self._url.render_as_string(), engine_kwargs=shared)
             connection.execute(text(TABLES))
         return storage
 
+    def _options(self, connect: Callable[[], Any]) -> dict[str, Any]:
+        import sqlalchemy as sql
+
+        # Workers hold no connection while they train: there may be hundreds.
+        return {"poolclass": sql.NullPool, "creator": connect, "use_native_hstore": False}
+
+    def _connect(self) -> Any:
+        arguments, options = self._engine.dialect.create_connect_args(self._url)
+        return _connection_class().connect(*arguments, **{**options, **CONNECTION})
+
     @property
     def optuna(self) -> optuna.storages.BaseStorage:
-        from optuna.storages import get_storage
-
-        if self._cache is None:
-            self._cache = get_storage(self._storage)
-        return self._cache
+        return self._storage
 
     # -- transactions -----------------------------------------------------------------------------------------------
 
@@ -156,20 +164,23 @@ class PostgresStorage(SharedStorage):
             with self._engine.begin() as connection:
                 connection.execute(text(f"SET LOCAL idle_in_transaction_session_timeout = '{IDLE_LIMIT:g}s'"))
                 self._lock(connection, f"study {self.study}")
-                # Optuna's commits become savepoints of this transaction.
-                self._bind_sessions(connection, "create_savepoint")
-                result = action()
+                connection.execute(text(f"SAVEPOINT {SAVEPOINT}"))
+                with self._shared(connection.connection.driver_connection):
+                    result = action()
             done = True
             return result
         finally:
-            self._bind_sessions(self._storage.engine, "conditional_savepoint")
-            if not done:  # the cache contains what was never written
-                self._cache = None
+            if not done:  # it has cached what was never written
+                self.opened = None
 
-    def _bind_sessions(self, bind: Connection | Engine, mode: str) -> None:
-        """Let Optuna's sessions use a connection, or connections of their own from an engine."""
-        self._storage.scoped_session.remove()
-        self._storage.scoped_session.configure(bind=bind, join_transaction_mode=mode)
+    @contextmanager
+    def _shared(self, connection: Any) -> Iterator[None]:
+        """Let Optuna work on this connection, as a part of its transaction, while the block runs."""
+        self._held, connection.held = connection, True
+        try:
+            yield
+        finally:
+            self._held, connection.held = None, False
 
     @staticmethod
     def _lock(connection: Connection, name: str) -> None:
@@ -331,6 +342,35 @@ class PostgresStorage(SharedStorage):
         with self._engine.begin() as connection:
             found = connection.execute(text(statement), parameters)
             return found.scalar() if found.returns_rows else None
+
+
+@cache
+def _connection_class() -> Any:
+    import psycopg
+
+    class Connection(psycopg.Connection):
+        """A connection whose transaction Optuna may be made a part of: its commits are then savepoints."""
+
+        held = False
+
+        def commit(self) -> None:
+            if self.held:
+                self.execute(f"RELEASE SAVEPOINT {SAVEPOINT}")
+                self.execute(f"SAVEPOINT {SAVEPOINT}")
+            else:
+                super().commit()
+
+        def rollback(self) -> None:
+            if self.held:
+                self.execute(f"ROLLBACK TO SAVEPOINT {SAVEPOINT}")
+            else:
+                super().rollback()
+
+        def close(self) -> None:
+            if not self.held:
+                super().close()
+
+    return Connection
 
 
 def _key(name: str) -> str:

@@ -28,11 +28,12 @@ class StudyStorage(ABC):
 
     study: str  # name of the Optuna study
     shared: bool
+    opened: optuna.Study | None = None  # it caches finished trials
 
     @property
     @abstractmethod
     def optuna(self) -> optuna.storages.BaseStorage:
-        """Storage of the Optuna study; read this property again in each call of `exclusively`."""
+        """Storage of the Optuna study."""
 
     @abstractmethod
     def exclusively(self, action: Callable[[], T]) -> T:

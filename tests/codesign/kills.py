@@ -47,7 +47,8 @@ def faults(folder: StudyFolder, seen: dict[int, Any]) -> list[str]:
     found += [f"trial {number} has no result, or its result has no trial" for number in unpaired]
     for trial in counted:
         record = records.get(trial.number)
-        if record is not None and (record.number, record.scores) != (trial.number, trial.values):
+        values = None if record is None or not record.scores else folder.config.signed(record.scores)
+        if record is not None and (record.number, values) != (trial.number, trial.values):
             found.append(f"trial {trial.number} has the result of another trial")
     for what, keys in (
         ("origin", [trial.user_attrs["origin"] for trial in counted]),

@@ -318,7 +318,8 @@ def test_dashboard(study):
 
     (summary,) = get("/api/studies")["study_summaries"]
     trials = get(f"/api/studies/{summary['study_id']}")["trials"]
-    assert [trial["values"] for trial in trials] == [record.scores for record in folder.results()]
+    assert summary["directions"] == ["minimize"] and summary["study_name"] == "tiny"
+    assert [trial["values"] for trial in trials] == [[r.evaluation.mean_distance] for r in folder.results()]
     shown = {attribute["key"]: attribute["value"] for attribute in trials[0]["user_attrs"]}
     assert float(shown["mean_distance"]) == folder.result(0).evaluation.mean_distance
     assert {"origin", "process", "success_rate"} <= shown.keys()

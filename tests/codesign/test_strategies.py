@@ -65,7 +65,7 @@ def test_shared_policy_with_pruning_by_goals(run):
     # Each goal was reported once, under its own number.
     for trial in open_study(folder).get_trials():
         record = folder.result(trial.number).evaluation.distances
-        np.testing.assert_allclose([-trial.intermediate_values[k] for k in range(len(record))], record)
+        np.testing.assert_allclose([trial.intermediate_values[k] for k in range(len(record))], record)
 
 
 def test_each_body_gets_a_policy_of_its_own_from_the_model(run):
@@ -120,7 +120,7 @@ def test_several_objectives_and_constraints(run):
         volume = trial.values["material_volume"]
         assert trial.scores == [-trial.evaluation.mean_distance, -volume]
         assert trial.violations == pytest.approx({"material_volume": volume - LIMIT})
-        assert study.get_trials()[trial.number].values == trial.scores
+        assert study.get_trials()[trial.number].values == [trial.evaluation.mean_distance, volume]
         assert study.get_trials()[trial.number].constraints == trial.violations
         assert volume == pytest.approx(folder.config.robot.build(trial.design).volume, rel=1e-12)
     allowed = [trial for trial in trials if trial.feasible]

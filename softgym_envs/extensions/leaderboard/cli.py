@@ -50,7 +50,8 @@ def show(name: str) -> None:
     problem = load_problem(name)
     definition = problem.definition
     click.echo(f"{name}: {definition.title}\ntrack {definition.track}: {TRACKS[definition.track]}")
-    click.echo(f"objectives: {', '.join(definition.score_names)} (larger is better)")
+    goals = (f"{name} ({direction})" for name, direction in zip(definition.titles, definition.directions, strict=True))
+    click.echo(f"objectives: {', '.join(goals)}; the score of what is minimised has the opposite sign")
     click.echo(f"judges: {', '.join(definition.judges)}; default {definition.judge}\nvariables:")
     for variable in definition.optimised.values():
         unit = "" if variable.unit == "1" else f" {variable.unit}"
@@ -113,10 +114,11 @@ def run(
             for name in names:
                 for method in methods:
                     found = runs.run(folder, name, method, judge, level, seed, listed, bodies)  # type: ignore[arg-type]
+                    definition = load_definition(name)
                     click.echo(
                         f"{name} {method} {found.judge} seed {seed}: {counted(found.bodies, 'body')}, "
-                        f"{found.spent['cpu_seconds']:.1f} CPU s, best {', '.join(load_definition(name).score_names)}: "
-                        f"{_scores(found.search_scores[:1])} (SI)"
+                        f"{found.spent['cpu_seconds']:.1f} CPU s, best {', '.join(definition.titles)}: "
+                        f"{_scores([definition.signed(scores) for scores in found.search_scores[:1]])}"
                     )
                     if fem:
                         references.check_winners(folder, [found])

@@ -20,7 +20,7 @@ def test_list_and_show(softgym, tiny):
 def test_run_and_table(softgym, tiny, tmp_path):
     verb = ["benchmark", "run", "tiny-v1", "--method", "random", "--folder", tmp_path]
     status, out, _ = softgym(*verb, "--seeds", "2")
-    assert status == 0 and "tiny-v1 random shared seed 1: 7 bodies" in out and "best -mean_distance: -" in out
+    assert status == 0 and "tiny-v1 random shared seed 1: 7 bodies" in out and "best mean_distance [m]: 0.00" in out
     status, out, err = softgym("benchmark", "table", "--folder", tmp_path)
     assert status == 0 and "| `tiny-v1` | shared | random | 2 |" in out and err == f"runs of {tmp_path}:\n"
     status, _, err = softgym("benchmark", "table", "--folder", tmp_path / "other")
