@@ -1,9 +1,8 @@
-"""Verbs for agents: train, evaluate, results."""
+"""Verbs for agents: train, evaluate."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -142,25 +141,3 @@ def evaluate(
     if output is not None:
         write_json(output, document)
         say(f"wrote {output}")
-
-
-@click.command()
-@click.option("--folder", type=options.PATH, help="Folder of stored runs (default: the shipped runs).")
-@click.option("--output", type=options.PATH, help="Write the table to this file instead of printing it.")
-@click.option("--curves", type=options.PATH, help="Draw the learning curves to this file (.png, .svg or .pdf).")
-@options.as_json
-def results(folder: Path | None, output: Path | None, curves: Path | None, as_json: bool) -> None:
-    """Print a table of training runs and draw their learning curves."""
-    from softgym_envs.agents.results import RESULTS, draw_curves, load_runs, summary, table
-    from softgym_envs.storage import atomic_write
-
-    runs = load_runs(folder or RESULTS)
-    text = json.dumps([asdict(row) for row in summary(runs)]) if as_json else table(runs)
-    if output is None:
-        click.echo(text)
-    else:
-        with atomic_write(output, "w") as stream:
-            stream.write(text)
-        click.echo(f"wrote {output}")
-    if curves is not None:
-        click.echo(f"wrote {draw_curves(runs, curves)}")

@@ -38,7 +38,6 @@ SECTIONS = {
     "Agents": {
         "train": "agents:train",
         "evaluate": "agents:evaluate",
-        "results": "agents:results",
     },
     "Design and control": {
         "demo": "demo:demo",

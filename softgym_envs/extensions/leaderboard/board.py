@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from softgym_envs.agents.statistics import Estimate, stratified_estimate
 from softgym_envs.codesign.metrics.metric import Metric
 from softgym_envs.errors import DataError
 from softgym_envs.extensions.leaderboard.frozen import load_definition, load_problem, problem_names
@@ -27,6 +26,7 @@ from softgym_envs.extensions.leaderboard.table import (
     shipped_tables,
 )
 from softgym_envs.extensions.leaderboard.winners import rank_correlation, stored_winners
+from softgym_envs.extensions.sweeps.statistics import Estimate, stratified_estimate
 from softgym_envs.wording import counted
 
 SUBMISSIONS = DATA / "submissions"

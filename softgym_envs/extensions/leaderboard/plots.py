@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from softgym_envs.agents.statistics import interquartile_mean
 from softgym_envs.extensions.design.plots import STYLE
 from softgym_envs.extensions.leaderboard.frozen import load_problem, problem_names
 from softgym_envs.extensions.leaderboard.problem import BenchmarkProblem
 from softgym_envs.extensions.leaderboard.regret import EQUAL, Contest, Stored, contests
 from softgym_envs.extensions.leaderboard.runs import stored_runs
 from softgym_envs.extensions.leaderboard.scoring import DATA, reference
+from softgym_envs.extensions.sweeps.statistics import interquartile_mean
 from softgym_envs.units import present
 
 COLOURS = {

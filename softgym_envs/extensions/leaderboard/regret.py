@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from softgym_envs.agents.statistics import Estimate, interquartile_mean, stratified_estimate
 from softgym_envs.extensions.leaderboard.frozen import FrozenProblem, load_problem
 from softgym_envs.extensions.leaderboard.runs import Run
 from softgym_envs.extensions.leaderboard.scoring import (
@@ -21,6 +20,7 @@ from softgym_envs.extensions.leaderboard.scoring import (
     normalised,
     reference,
 )
+from softgym_envs.extensions.sweeps.statistics import Estimate, interquartile_mean, stratified_estimate
 
 FINISHED = 0.01
 """Regret below which a search counts as finished."""

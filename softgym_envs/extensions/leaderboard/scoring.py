@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from softgym_envs.agents.statistics import Estimate, bootstrap
 from softgym_envs.codesign.records import Record
 from softgym_envs.errors import DataError
 from softgym_envs.extensions.leaderboard.frozen import FrozenProblem
 from softgym_envs.extensions.leaderboard.problem import JudgedScore
+from softgym_envs.extensions.sweeps.statistics import Estimate, bootstrap
 from softgym_envs.storage import read_json, write_json
 
 DATA = Path(__file__).parent / "data"

@@ -8,13 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from softgym_envs.agents import sweep
 from softgym_envs.agents.config import EnvironmentConfig, TrainConfig
-from softgym_envs.agents.results import draw_curves, load_runs, table
-from softgym_envs.agents.statistics import crossed_estimate, interquartile_mean, stratified_estimate
-from softgym_envs.config import load_config, shipped_configs
+from softgym_envs.cli.app import main
+from softgym_envs.config import check_config, difference, load_config, shipped_configs
 from softgym_envs.envs.registration import ENVIRONMENTS
 from softgym_envs.errors import ConfigError, DataError
+from softgym_envs.extensions.sweeps import sweep
+from softgym_envs.extensions.sweeps.results import draw_curves, load_runs, table
+from softgym_envs.extensions.sweeps.statistics import crossed_estimate, interquartile_mean, stratified_estimate
+from softgym_envs.extensions.sweeps.sweep import run_sweep
+from softgym_envs.runs import RunFolder
 
 ROOT = Path(__file__).resolve().parents[2]
 CONFIGS = list(shipped_configs("agents").values())
@@ -94,19 +97,8 @@ def test_scores_that_cannot_be_resampled_have_no_interval():
 def swept(tmp_path_factory):
     folder = tmp_path_factory.mktemp("sweep")
     (folder / "tiny.yaml").write_text(TINY)
-    command = [
-        sys.executable,
-        "-m",
-        "softgym_envs.agents.sweep",
-        "--configs",
-        "tiny.yaml",
-        "--seeds",
-        "0",
-        "3",
-        "--processes",
-        "2",
-    ]
-    command += ["--folder", "out", "--goals", "5", "--fem-goals", "2"]
+    command = [sys.executable, "-m", "softgym_envs.cli", "sweep", "tiny.yaml", "--seed", "0", "--seed", "3"]
+    command += ["--workers", "2", "--folder", "out", "--goals", "5", "--fem-goals", "2"]
     done = subprocess.run(command, cwd=folder, env=_environment(), capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return folder
@@ -136,9 +128,9 @@ def test_a_finished_sweep_runs_nothing_and_a_lost_result_is_computed_again(swept
     place = swept / "out" / "results" / "tiny"
     before = (place / "seed0.json").read_text()
     monkeypatch.setattr("softgym_envs.agents.training.LEARNERS", {})  # a training would fail
-    assert sweep.sweep([swept / "tiny.yaml"], [0, 3], 1, swept / "out", goals=5, fem_goals=2) == 0
+    assert run_sweep([swept / "tiny.yaml"], [0, 3], 1, swept / "out", goals=5, fem_goals=2) == 0
     (place / "seed0.json").unlink()
-    assert sweep.sweep([swept / "tiny.yaml"], [0, 3], 1, swept / "out", goals=5, fem_goals=2) == 0
+    assert run_sweep([swept / "tiny.yaml"], [0, 3], 1, swept / "out", goals=5, fem_goals=2) == 0
     again, first = json.loads((place / "seed0.json").read_text()), json.loads(before)
     assert (
         again["evaluations"]["surrogate"]["sac"]["distances"] == first["evaluations"]["surrogate"]["sac"]["distances"]
@@ -150,35 +142,28 @@ def test_a_sweep_refuses_results_of_another(swept, tmp_path):
     given = {"goals": 5, "fem_goals": 2}
     other = tmp_path / "tiny.yaml"
     other.write_text(TINY.replace("gradient_steps: 1", "gradient_steps: 2"))
-    with pytest.raises(DataError, match=r"seed0\.json' belongs to another sweep: sac\.gradient_steps = 1, got 2"):
-        sweep.sweep([other], [0], 1, out, **given)
-    other.write_text(TINY.replace("v0}", "v0, action_mode: absolute}"))
-    with pytest.raises(DataError, match=r"baselines\.json' .*: environment\.action_mode = 'increment', got 'absolute'"):
-        sweep.sweep([other], [1], 1, out, **given)
-    with pytest.raises(DataError, match=r"goals = \{'surrogate': 5, 'fem': 2\}, got \{'surrogate': 6, 'fem': 2\}"):
-        sweep.sweep([swept / "tiny.yaml"], [0], 1, out, goals=6, fem_goals=2)
-    moved = tmp_path / "moved" / "results" / "tiny"
-    moved.mkdir(parents=True)
-    (moved / "seed1.json").write_text((out / "results" / "tiny" / "seed0.json").read_text())
-    with pytest.raises(DataError, match=r"seed1\.json' .*: seed = 0, got 1"):
-        sweep.sweep([swept / "tiny.yaml"], [1], 1, tmp_path / "moved", **given)
-    for text in ("{", "[]", '{"environment": {"id": "SoftGym/FingerReach-v0"}}'):
-        (moved / "seed1.json").write_text(text)
-        with pytest.raises(DataError, match=r"seed1\.json' (cannot be read|is not the result of a sweep)"):
-            sweep.sweep([swept / "tiny.yaml"], [1], 1, tmp_path / "moved", **given)
+    with pytest.raises(ConfigError, match=r"holds a sweep with configs\.tiny\.sac\.gradient_steps = 1, got 2; use"):
+        run_sweep([other], [0], 1, out, **given)
+    with pytest.raises(ConfigError, match=r"holds a sweep with goals = 5, got 6; use another folder"):
+        run_sweep([swept / "tiny.yaml"], [0], 1, out, goals=6, fem_goals=2)
+    with RunFolder(out, sweep.SweepConfig, "a sweep").alone():
+        with pytest.raises(ConfigError, match="in use by another process"):
+            run_sweep([swept / "tiny.yaml"], [0], 1, out, **given)
+    place = out / "results" / "tiny"
+    for text in ("{", "[]", (place / "seed0.json").read_text()):  # the last one is of another seed
+        (place / "seed1.json").write_text(text)
+        with pytest.raises(DataError, match=r"seed1\.json' (cannot be read|was edited, damaged or renamed).*remove it"):
+            run_sweep([swept / "tiny.yaml"], [1], 1, out, **given)
+    (place / "seed1.json").unlink()
 
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
-def test_stored_results_count_as_finished(path):
+def test_stored_results_are_of_the_shipped_configurations(path):
     config = load_config(path, TrainConfig)
-    # As the page of benchmarks says.
-    fem_goals = {"finger_grasp": 20, "sensorized_finger_reach": 20, "tetrapod_reach_analytic": 50}.get(path.stem, 10)
-    goals = 100
-    if path.stem == "sensorized_finger_reach_recurrent":
-        goals = fem_goals = 20
-    for stored in sorted((ROOT / "agents" / "results" / path.stem).glob("*.json")):
-        seed = json.loads(stored.read_text()).get("seed", 0)
-        assert sweep._finished(stored, config.model_copy(update={"seed": seed}), goals=goals, fem_goals=fem_goals)
+    for stored in sorted((ROOT / "agents" / "results" / path.stem).glob("seed*.json")):
+        run = json.loads(stored.read_text())
+        old = check_config(TrainConfig, run["config"], f"result '{stored}'")
+        assert difference(old, config.model_copy(update={"seed": run["seed"]})) is None
 
 
 def test_an_error_in_one_job_does_not_stop_the_others(swept, tmp_path, capsys):
@@ -186,12 +171,12 @@ def test_an_error_in_one_job_does_not_stop_the_others(swept, tmp_path, capsys):
     broken = tmp_path / "out" / "runs" / "tiny" / "seed1"
     broken.mkdir(parents=True)
     (broken / "config.yaml").write_text((swept / "out/runs/tiny/seed0/config.yaml").read_text())  # of seed 0
-    assert sweep.sweep([tmp_path / "tiny.yaml"], [1], 1, tmp_path / "out", goals=2, fem_goals=0) == 1
+    assert run_sweep([tmp_path / "tiny.yaml"], [1], 1, tmp_path / "out", goals=2, fem_goals=0) == 1
     assert "holds a training with seed = 0, got 1" in capsys.readouterr().out
     assert (tmp_path / "out/results/tiny/baselines.json").exists()
     (tmp_path / "bad.yaml").write_text("environment: {id: SoftGym/Octopus-v0}")
     with pytest.raises(ConfigError, match="Octopus"):
-        sweep.sweep([tmp_path / "bad.yaml"], [1], 1, tmp_path / "out")
+        run_sweep([tmp_path / "bad.yaml"], [1], 1, tmp_path / "out")
 
 
 def test_environments_on_fem_are_evaluated_on_the_goals_for_fem(tmp_path):
@@ -201,7 +186,7 @@ def test_environments_on_fem_are_evaluated_on_the_goals_for_fem(tmp_path):
     path = tmp_path / "tiny.yaml"
     path.write_text(TINY.replace("v0}", "v0, backend: fem}"))
     with pytest.raises(ConfigError, match=r"fem_goals = 0, but the environment of '.*tiny\.yaml' runs on FEM"):
-        sweep.sweep([path], [0], 1, tmp_path / "out", goals=5, fem_goals=0)
+        run_sweep([path], [0], 1, tmp_path / "out", goals=5, fem_goals=0)
     assert not (tmp_path / "out").exists()
 
 
@@ -237,12 +222,13 @@ def test_the_table_and_the_curves(swept, tmp_path):
         load_runs(tmp_path)
 
 
-def test_an_interrupted_sweep_says_how_to_go_on(monkeypatch, tmp_path, capsys):
+def test_an_interrupted_sweep_says_how_to_go_on(swept, monkeypatch, tmp_path):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(sweep, "sweep", interrupt)
-    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "SOFTGYM_CACHE"):
-        monkeypatch.setenv(variable, "1")  # so that what `main` sets is undone
-    assert sweep.main(["--configs", "any.yaml", "--folder", str(tmp_path)]) == 130
-    assert capsys.readouterr().err == "stopped; run the same command again to continue\n"
+    monkeypatch.setattr(sweep, "run_sweep", interrupt)
+    command = ["sweep", str(swept / "tiny.yaml"), "--folder", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", ["softgym", *command])
+    with pytest.raises(SystemExit) as stopped:
+        main()
+    assert stopped.value.code == 130

@@ -1,4 +1,4 @@
-"""Tables and learning curves of stored runs, which `softgym_envs.agents.sweep` writes."""
+"""Tables and learning curves of stored runs, which `softgym_envs.extensions.sweeps.sweep` writes."""
 
 from __future__ import annotations
 
@@ -12,18 +12,19 @@ from typing import TYPE_CHECKING, TypedDict
 
 import numpy as np
 
+from softgym_envs import agents
 from softgym_envs.agents.baselines import BASELINES
 from softgym_envs.agents.config import EnvironmentConfig
 from softgym_envs.agents.learners import LEARNERS
-from softgym_envs.agents.statistics import Estimate, crossed_estimate, stratified_estimate
 from softgym_envs.config import check_config
 from softgym_envs.errors import DataError
+from softgym_envs.extensions.sweeps.statistics import Estimate, crossed_estimate, stratified_estimate
 from softgym_envs.storage import read_json
 
 if TYPE_CHECKING:
     from softgym_envs.agents.training import CurvePoint
 
-RESULTS = Path(__file__).parent / "results"
+RESULTS = Path(agents.__file__ or "").parent / "results"
 """Stored runs of the configurations in ``configs/agents``."""
 
 
@@ -150,10 +151,7 @@ def load_runs(folder: str | Path = RESULTS) -> list[StoredRuns]:
             same.runs.extend(runs)
             same.baselines.update(baselines)
     if not found:
-        raise DataError(
-            f"'{folder}' contains no results (<config>/seed<k>.json); create them with "
-            "python -m softgym_envs.agents.sweep"
-        )
+        raise DataError(f"'{folder}' contains no results (<config>/seed<k>.json); create them with softgym sweep")
     return found
 
 

@@ -1,0 +1,1 @@
+"""Sweeps: many configurations of trainings with several seeds, their tables and learning curves."""
