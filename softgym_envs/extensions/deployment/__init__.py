@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from softgym_envs.extensions.deployment.cad import export_body as export_body
     from softgym_envs.extensions.deployment.controller_c import export_controller_c as export_controller_c
     from softgym_envs.extensions.deployment.embedded import EmbeddedLoop as EmbeddedLoop
+    from softgym_envs.extensions.deployment.mjcf import export_mjcf as export_mjcf
     from softgym_envs.extensions.deployment.moulds import export_moulds as export_moulds
     from softgym_envs.extensions.deployment.policy_c import export_policy_c as export_policy_c
     from softgym_envs.extensions.deployment.policy_onnx import export_policy_onnx as export_policy_onnx
@@ -20,6 +21,7 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "cad": ["export_body"],
         "controller_c": ["export_controller_c"],
         "embedded": ["EmbeddedLoop"],
+        "mjcf": ["export_mjcf"],
         "moulds": ["export_moulds"],
         "policy_c": ["export_policy_c"],
         "policy_onnx": ["export_policy_onnx"],

@@ -32,6 +32,9 @@ SECTION = 24
 ROTATION = 1e-4
 """Rotation of the tip [rad] by the moments with which the compliance is measured."""
 
+SKIN = '"0.96 0.85 0.75 1"'
+"""Colour of the links."""
+
 
 @dataclass(frozen=True)
 class Joint:
@@ -331,7 +334,7 @@ def _document(chain: Chain, largest: np.ndarray, damping: float) -> str:
         faces = " ".join(map(str, link.triangles.ravel()))
         assets.append(f'<mesh name={quoteattr(label)} vertex="{_numbers(link.points - origin)}" face="{faces}"/>')
         # Links touch other objects, but not each other.
-        bodies.append(f'<geom type="mesh" mesh={quoteattr(label)} contype="0" conaffinity="1" mass="0"/>')
+        bodies.append(f'<geom type="mesh" mesh={quoteattr(label)} rgba={SKIN} contype="0" conaffinity="1" mass="0"/>')
         for cable, (points, owners) in chain.cables.items():
             for index in np.flatnonzero(owners == number):
                 site = f"{name}_{cable}_{index}"
