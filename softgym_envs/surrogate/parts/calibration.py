@@ -118,8 +118,8 @@ def compare(robot: Robot, part: LearnedLeg, *, bodies: int, seed: int, strata: t
                 continue
             judged = judge(statics, robot, found.x, found.effort, held)
             rows.append((stratum, command, *_errors(found.condensed, true), *_verdict(judged)))
-    columns: list[Any] = [np.array(column) for column in zip(*rows, strict=True)]
-    return Comparison(*columns, *(lost, failed))
+    columns: list[Any] = [*(np.array(column) for column in zip(*rows, strict=True)), lost, failed]
+    return Comparison(*columns)
 
 
 def _verdict(judged: Judged) -> tuple[float, float, bool, bool]:
