@@ -18,7 +18,7 @@ from softgym_envs.mechanics.solvers.dynamics import Motion
 from softgym_envs.mechanics.solvers.equilibrium import SATURATED, Equilibrium
 from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.parts.trust import judge
-from softgym_envs.surrogate.parts.weights import LearnedLeg
+from softgym_envs.surrogate.parts.weights import of_learned_parts
 
 
 class PartsBackend(FEMBackend):
@@ -58,13 +58,7 @@ class PartsBackend(FEMBackend):
         mass_damping: float = 0.0,
         stiffness_damping: float = 0.01,
     ) -> None:
-        if robot.may_touch:
-            raise ValueError(
-                f"robot '{robot.name}': learned parts do not touch anything, got obstacles or self_contact; use "
-                "backend='fem'"
-            )
-        self.part = LearnedLeg(weights)
-        self._learned = robot.of_parts({"leg": self.part})
+        self._learned, self.part = of_learned_parts(robot, weights)
         super().__init__(
             robot, design, dynamics=dynamics, control_step=control_step, time_step=time_step,
             mass_damping=mass_damping, stiffness_damping=stiffness_damping,

@@ -24,7 +24,7 @@ from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.parts.energy import LegFunction
 from softgym_envs.surrogate.parts.leg import LegScale
 from softgym_envs.surrogate.parts.trust import SOFTEST
-from softgym_envs.surrogate.parts.weights import LearnedLeg
+from softgym_envs.surrogate.parts.weights import of_learned_parts
 
 NEWTON_STEPS, MAX_NEWTON_STEPS = 4, 25
 """Newton steps of every row in a time step, and of rows that take more."""
@@ -62,12 +62,7 @@ class TorchParts:
         dynamics: bool = False,
         **options: Any,
     ) -> None:
-        if robot.may_touch:
-            raise ValueError(
-                f"robot '{robot.name}': learned parts do not touch anything, got obstacles or self_contact"
-            )
-        self.part = LearnedLeg(weights)
-        self._robot = robot.of_parts({"leg": self.part})
+        self._robot, self.part = of_learned_parts(robot, weights)
         self.device, self.dtype, self.moving = device, dtype, dynamics
         self.steps = TimeSteps(**options)
         self.count = len(robot.actuators)

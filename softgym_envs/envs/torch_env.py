@@ -21,7 +21,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
-from softgym_envs.backends.torch_batch import MAX_NEWTON_STEPS, Bodies, TorchBatch, put_rows, repeat_body, take_rows
+from softgym_envs.backends.torch_batch import Bodies, State, TorchBatch, put_rows, repeat_body, take_rows
+from softgym_envs.backends.torch_parts import TorchParts
 from softgym_envs.envs.arrays import with_tensors
 from softgym_envs.envs.options import (
     EnvironmentOptions,
@@ -36,16 +37,13 @@ from softgym_envs.envs.options import (
     take_reset_mask,
     task_by_row,
 )
-from softgym_envs.envs.registration import ENVIRONMENTS, find_row
+from softgym_envs.envs.registration import ENVIRONMENTS, EnvironmentRow, find_row
 from softgym_envs.envs.tasks.base import draw_paths
+from softgym_envs.robots.registry import ROBOTS
 from softgym_envs.surrogate.pretrained import standalone_model
 
 if TYPE_CHECKING:
     from softgym_envs.envs.registration import RobotSource, TaskSource
-
-#: Newton steps of every row, with one Hessian. With random actions 7 % of the rows of GripperPinch and 2 % of the rows
-#: of the cable trunk need more; those of the other robots do not.
-NEWTON_STEPS = 4
 
 Result = dict[str, Any]
 
@@ -99,10 +97,12 @@ class TorchVectorEnv(VectorEnv[Tensor, Tensor, Tensor]):
         _check_torch(self.device, dtype, cuda_graph)
         row = find_row(id)
         setup = set_up(
-            robot or row.robot, task or row.task, row.backend, EnvironmentOptions.check(row.defaults | options)
+            robot or row.robot, task or row.task, _backend_of(row), EnvironmentOptions.check(row.defaults | options)
         )
         _check_setup(id, setup)
-        self.robot, self.task, self.spaces = setup.robot, setup.task, setup.spaces()
+        self.robot, self.task = setup.robot, setup.task
+        self._model = _model_of(setup, self.device, dtype)
+        self.spaces = setup.spaces(moving=self._model.moving)
         self.design_space = self.robot.design_space
         self.num_envs, self.dtype = num_envs, dtype
         self.max_episode_steps = row.max_episode_steps if max_episode_steps is None else max_episode_steps
@@ -114,7 +114,6 @@ class TorchVectorEnv(VectorEnv[Tensor, Tensor, Tensor]):
         self.metadata = {"autoreset_mode": self.autoreset_mode, "render_modes": []}
         self.render_mode, self.spec = None, gymnasium.spec(id)
         self._task, self._spaces = with_tensors(self.task, self._put), with_tensors(self.spaces, self._put)
-        self._model = TorchBatch(standalone_model(self.robot, **setup.backend_options), self.device, dtype)
 
         # Designs are kept in double precision: near 0.5 a Poisson's ratio needs its digits.
         variables = list(self.design_space)
@@ -194,12 +193,7 @@ class TorchVectorEnv(VectorEnv[Tensor, Tensor, Tensor]):
         n = self._model.count
         parts = {
             "command": torch.zeros(1, n, dtype=self.dtype, device=self.device),
-            "u": bodies["rest"],
-            "effort": bodies["rest_effort"],
-            "effector": bodies["rest_effector"],
-            "slack": torch.zeros(1, n, dtype=torch.bool, device=self.device),
-            "uncertainty": bodies["rest_uncertainty"],
-            "trusted": bodies["rest_trusted"],
+            **self._model.at_rest(bodies),
             "converged": torch.ones(1, dtype=torch.bool, device=self.device),
             "steps": torch.zeros(1, dtype=torch.int64, device=self.device),
             "paths": torch.zeros(1, 1, 3, dtype=self.dtype, device=self.device),
@@ -232,12 +226,7 @@ class TorchVectorEnv(VectorEnv[Tensor, Tensor, Tensor]):
 
     def _kinematics(self, index: Tensor, commands: Tensor) -> Tensor:
         """Return the effectors [m] (B, 3) of rows (B,) under commands (B, n_a); NaN where no equilibrium is found."""
-        bodies, target = take_rows(self._bodies, index), self._scaled(commands)
-        u, _, found = self._model.search(bodies, target, target, MAX_NEWTON_STEPS, stop=True)
-        return torch.where(found[:, None], self._model.measure(bodies, u, u)[0], torch.nan)
-
-    def _scaled(self, command: Tensor) -> Tensor:
-        return (command - self._model.middle) / self._model.half_range
+        return self._model.kinematics(take_rows(self._bodies, index), commands)
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: Mapping[str, Any] | None = None
@@ -378,48 +367,28 @@ class TorchVectorEnv(VectorEnv[Tensor, Tensor, Tensor]):
 
         return replay
 
-    def _advance(self, bodies: Bodies, state: dict[str, Tensor], actions: Tensor) -> Result:
-        """Return the result of a step with `NEWTON_STEPS` Newton steps in every row; it changes nothing."""
+    def _advance(self, bodies: Bodies, state: State, actions: Tensor) -> Result:
+        """Return the result of a step with the same few Newton steps in every row; it changes nothing."""
         command = self._spaces.command(actions.clamp(-1.0, 1.0), state["command"])
-        target = self._scaled(command)
-        u, gradient, found = self._model.search(bodies, target, _guess(state, target), NEWTON_STEPS)
-        result = self._new_state(bodies, state, command, u, gradient, found)
+        new, found = self._model.advance(bodies, state, command)
+        result = self._new_state(bodies, state, {"command": command, **new}, found)
         flags = torch.stack([torch.isfinite(actions).all(), found.all(), result["truncated"].any()])
-        return result | {"flags": flags, "search": (command, u, gradient, found)}
+        return result | {"flags": flags, "search": ({"command": command, **new}, found)}
 
     def _finish(self, result: Result) -> Result:
-        """Continue the search where `NEWTON_STEPS` Newton steps were not enough."""
-        command, u, gradient, found = result["search"]
+        """Continue the search where the fixed number of Newton steps was not enough."""
+        new, found = result["search"]
         rows = torch.nonzero(~found)[:, 0]
-        target = self._scaled(command)
-        parts = self._model.search(
-            take_rows(self._bodies, rows),
-            target[rows],
-            _guess(self._state, target)[rows],
-            MAX_NEWTON_STEPS,
-            stop=True,
-        )
-        u, gradient, found = (x.index_copy(0, rows, part) for x, part in zip((u, gradient, found), parts, strict=True))
-        return self._new_state(self._bodies, self._state, command, u, gradient, found)
+        state = {name: value[rows] for name, value in self._state.items()}
+        more, solved = self._model.finish(take_rows(self._bodies, rows), state, new["command"][rows])
+        new = {name: value.index_copy(0, rows, more[name]) if name in more else value for name, value in new.items()}
+        return self._new_state(self._bodies, self._state, new, found.index_copy(0, rows, solved))
 
-    def _new_state(
-        self, bodies: Bodies, state: dict[str, Tensor], command: Tensor, u: Tensor, gradient: Tensor, found: Tensor
-    ) -> Result:
+    def _new_state(self, bodies: Bodies, state: State, new: State, found: Tensor) -> Result:
         """Return the state after a search, with observation, reward, info and the rows that end."""
-        effector, uncertainty, trusted = self._model.measure(bodies, u, self._scaled(command))
-        effort, slack = self._model.efforts(bodies, self._scaled(command), u, gradient)
-        new = {
-            "command": command,
-            "u": u,
-            "effort": effort,
-            "effector": effector,
-            "slack": slack,
-            "uncertainty": uncertainty,
-            "trusted": trusted,
-        }
         # Rows without an equilibrium keep their state, and their episodes end.
         new = {
-            name: torch.where(found if value.ndim == 1 else found[:, None], value, state[name])
+            name: torch.where(found.reshape(-1, *(1,) * (value.ndim - 1)), value, state[name])
             for name, value in new.items()
         }
         new |= {"converged": found, "steps": state["steps"] + 1}
@@ -449,8 +418,23 @@ class TorchVectorEnv(VectorEnv[Tensor, Tensor, Tensor]):
             "trusted": state["trusted"].clone(),
             "converged": state["converged"].clone(),
         }
-        observation = self._spaces.observe(command, displacement, effort, effector, aim, unit_design)
+        observation = self._spaces.observe(
+            command, displacement, effort, effector, aim, unit_design, state.get("velocity")
+        )
         return {"observation": observation, "reward": reward, "info": info}
+
+
+def _backend_of(row: EnvironmentRow) -> str | None:
+    """Return the backend of an ID on tensors: bodies of learned parts have one, whatever the default of their ID is."""
+    found = ROBOTS.resolve(row.robot) if isinstance(row.robot, str) else row.robot
+    return "surrogate" if getattr(found, "learned_parts", ()) else row.backend
+
+
+def _model_of(setup: Setup, device: torch.device, dtype: torch.dtype) -> TorchBatch | TorchParts:
+    """Return what finds the states of many bodies: of learned parts, or of one learned model."""
+    if setup.robot.learned_parts:
+        return TorchParts(setup.robot, device, dtype, **setup.backend_options)
+    return TorchBatch(standalone_model(setup.robot, **setup.backend_options), device, dtype)
 
 
 def _check_torch(device: torch.device, dtype: torch.dtype, cuda_graph: bool) -> None:
@@ -468,9 +452,9 @@ def _check_torch(device: torch.device, dtype: torch.dtype, cuda_graph: bool) -> 
 def _check_setup(id: str, setup: Setup) -> None:
     """Raise ValueError for an environment that cannot be computed with tensors."""
     if setup.backend != "surrogate":
-        supported = [name for name, other in ENVIRONMENTS.items() if other.backend == "surrogate"]
+        supported = [name for name, other in ENVIRONMENTS.items() if _backend_of(other) == "surrogate"]
         raise ValueError(f"id = {id!r} is not an environment on the surrogate; allowed: {', '.join(supported)}")
-    if setup.backend_options.get("dynamics", False):
+    if setup.backend_options.get("dynamics", False) and not setup.robot.learned_parts:
         raise ValueError("dynamics is not available on tensors; allowed: False, or gymnasium.make_vec")
     if setup.plants is not None:
         raise ValueError("plant is not available on tensors; allowed: None, or gymnasium.make_vec")
@@ -493,11 +477,6 @@ class _TorchRandom:
 
     def integers(self, low: int, *, size: int) -> Tensor:
         return torch.randint(low, (size,), generator=self._generator, device=self._generator.device)
-
-
-def _guess(state: dict[str, Tensor], target: Tensor) -> Tensor:
-    """Return where a search begins: slack cables at their displacement, the others at their command."""
-    return torch.where(state["slack"], torch.maximum(state["u"], target), target)
 
 
 def _map(function: Callable[[Tensor], Tensor], tree: Any) -> Any:

@@ -8,7 +8,6 @@ from gymnasium.error import ResetNeeded
 
 import softgym_envs
 from softgym_envs.backends import torch_batch
-from softgym_envs.envs import torch_env
 from softgym_envs.envs.torch_env import TorchVectorEnv
 from softgym_envs.errors import DesignError, WeightsError
 from softgym_envs.mechanics.solvers.complementarity import solve_complementarity
@@ -151,7 +150,7 @@ def test_rows_without_a_state_end_where_they_were(monkeypatch):
 
 def test_rows_that_take_longer_are_finished(monkeypatch):
     """With a single Newton step for all rows, most rows are finished separately and reach the same states."""
-    monkeypatch.setattr(torch_env, "NEWTON_STEPS", 1)
+    monkeypatch.setattr(torch_batch, "NEWTON_STEPS", 1)
     reference, env = pair("SoftGym/DiamondReach-v0", 8, sample_design=True)
     finish, calls = env._finish, []
     monkeypatch.setattr(env, "_finish", lambda result: calls.append(1) or finish(result))
@@ -278,7 +277,7 @@ def test_complementarity(n, monkeypatch):
 
 def test_bad_input():
     for options, message in (
-        ({"id": "SoftGym/TetrapodReach-v0"}, "TetrapodReach.*allowed.*FingerReach"),
+        ({"id": "SoftGym/ModularReach-v0"}, "ModularReach.*allowed.*FingerReach.*TetrapodReach"),
         ({"num_envs": 0}, "num_envs = 0"),
         ({"dtype": torch.float16}, "float16.*float32"),
         ({"backend_options": {"members": 9}}, "members = 9.*1 to 5"),

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.errors import DataError, WeightsError
+from softgym_envs.robots.base import Robot
 from softgym_envs.robots.tetrapod import Tetrapod
 from softgym_envs.storage import read_json
 from softgym_envs.surrogate.domain import EDGE
@@ -186,3 +187,22 @@ class LearnedLeg:
             "mass": float(scale.mass),
             "young_modulus": float(design["young_modulus"]),
         }
+
+
+def of_learned_parts(robot: Robot, folder: str | Path | None = None) -> tuple[Robot, LearnedLeg]:
+    """Return a robot whose bodies consist of learned parts, and the part.
+
+    Args:
+        robot: the robot.
+        folder: of the weights of the part; default the shipped ones.
+
+    Raises:
+        WeightsError: as `read_leg`.
+        ValueError: for a robot that may touch something.
+    """
+    if robot.may_touch:
+        raise ValueError(
+            f"robot '{robot.name}': learned parts touch nothing, got obstacles or self_contact; use backend='fem'"
+        )
+    part = LearnedLeg(folder)
+    return robot.of_parts({"leg": part}), part
