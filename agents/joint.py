@@ -15,7 +15,7 @@ import numpy as np
 
 from softgym_envs.agents.config import EnvironmentConfig, TrainConfig
 from softgym_envs.envs.vector_env import SoftRobotVectorEnv
-from softgym_envs.storage import read_json, write_json
+from softgym_envs.storage import read_signed, write_signed
 
 if TYPE_CHECKING:
     from stable_baselines3 import SAC
@@ -65,7 +65,7 @@ class DesignProposer(ABC):
     def finish(self, model: SAC) -> None:
         """Write the most promising bodies to ``bodies.json``, in unit coordinates."""
         found = self.best(model, 32)
-        write_json(self.folder / "bodies.json", {"names": list(self.names), "bodies": found.tolist()})
+        write_signed(self.folder / "bodies.json", {"names": list(self.names), "bodies": found.tolist()})
 
     def restore(self, model: SAC) -> None:  # noqa: B027 - optional, for proposers with a state
         """Restore what `save` wrote at the model's step."""
@@ -164,7 +164,7 @@ class DistributionProposer(DesignProposer):
         rng = np.random.default_rng([self.config.seed, self.size])
         path = self._path(model.num_timesteps)
         if path.exists():
-            stored = read_json(path)
+            stored = read_signed(path)
             self.logits, self.means, self.spreads = (np.array(stored[k]) for k in ("logits", "means", "spreads"))
         else:
             self.logits = np.zeros(self.components)
@@ -179,7 +179,7 @@ class DistributionProposer(DesignProposer):
         self._episodes = []  # all episodes restart here, so none is counted twice after an interruption
 
     def save(self, step: int) -> None:
-        write_json(
+        write_signed(
             self._path(step),
             {
                 "names": list(self.names),

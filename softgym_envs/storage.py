@@ -154,6 +154,8 @@ def drop_torn_line(path: str | Path) -> None:
 class JsonLines:
     """Append-only file with one JSON record per line, which survives a crash in the middle of a write.
 
+    Each line has a hash by which an edited one is noticed.
+
     Args:
         path: the file; it need not exist yet. Only one process may write to it at a time.
     """
@@ -166,7 +168,7 @@ class JsonLines:
         """Return all records, in the order in which they were written.
 
         Raises:
-            DataError: if a line is not a JSON object; the message names the line.
+            DataError: if a line is damaged or was edited; the message names the line.
         """
         if not self.path.exists():
             return []
@@ -176,8 +178,10 @@ class JsonLines:
                 record = json.loads(line)
             except (ValueError, RecursionError):
                 record = None
-            if not isinstance(record, dict):
-                raise DataError(f"'{self.path}', line {number} is damaged; remove the line to compute its record again")
+            if not isinstance(record, dict) or record.pop(SIGNATURE, None) != _signature(self.path, record):
+                raise DataError(
+                    f"'{self.path}', line {number} is damaged or was edited; remove it to compute its record again"
+                )
             records.append(record)
         return records
 
@@ -185,7 +189,7 @@ class JsonLines:
         """Write one record at the end."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with self.path.open("a") as stream:
-            stream.write(json.dumps(record) + "\n")
+            stream.write(json.dumps({**record, SIGNATURE: _signature(self.path, record)}) + "\n")
 
 
 def cache_directory(name: str) -> Path:

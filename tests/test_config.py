@@ -105,10 +105,12 @@ def test_a_torn_line_is_dropped_and_nothing_else(tmp_path):
     assert path.read_bytes() == b"" and JsonLines(path).read() == []
 
 
-@pytest.mark.parametrize("line", [b"{", b"3", b"\xff"])
+@pytest.mark.parametrize("line", [b"{", b"3", b"\xff", b""])
 def test_a_damaged_line_is_named(line, tmp_path):
     path = tmp_path / "records.jsonl"
-    path.write_bytes(b'{"number": 0}\n' + line + b"\n")
+    JsonLines(path).append({"number": 0})
+    edited = path.read_bytes().replace(b'"number": 0', b'"number": 1').strip()
+    path.write_bytes(path.read_bytes() + (line or edited) + b"\n")
     with pytest.raises(DataError, match=r"records\.jsonl', line 2 is damaged"):
         JsonLines(path).read()
 

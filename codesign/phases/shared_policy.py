@@ -17,7 +17,7 @@ from softgym_envs.agents.training import cpu_before, train
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.folder import SHARED_POLICY, SHARED_POLICY_RECORD, StudyFolder
 from softgym_envs.codesign.records import Job, SharedPolicy
-from softgym_envs.storage import atomic_write, read_json
+from softgym_envs.storage import atomic_write, read_signed
 
 
 def shared_policy_jobs(folder: StudyFolder) -> list[Job]:
@@ -73,7 +73,7 @@ def _make(folder: StudyFolder) -> SharedPolicy:
         proposer = PROPOSERS[config.plan.proposer](**options)
         source = train(joint_config(folder), training, proposer=proposer, progress=False)
         before = cpu_before(source, cpu)
-        found = read_json(training / "bodies.json")
+        found = read_signed(training / "bodies.json")
         space = config.space
         record.bodies = [
             {name: float(space[name].from_unit(value)) for name, value in zip(found["names"], body, strict=True)}

@@ -19,7 +19,7 @@ from softgym_envs.extensions.design.parameters import Parameters
 from softgym_envs.extensions.design.plots import draw_calibration
 from softgym_envs.extensions.design.records import CalibrationResult, Fit
 from softgym_envs.runs import RunFolder, provenance
-from softgym_envs.storage import write_json
+from softgym_envs.storage import write_signed
 from softgym_envs.wording import counted
 
 MIN_SENSITIVITY = 1e-7
@@ -49,7 +49,7 @@ def calibrate(
         return _calibrate(config, data)
     with RunFolder(folder, CalibrationConfig, "a calibration").reserve(config) as place:
         result = _calibrate(config, data)
-        write_json(place / "result.json", {**provenance(), **result.to_json()})
+        write_signed(place / "result.json", {**provenance(), **result.to_json()})
         draw_calibration(place / "calibration.png", fitted_units(config), result)
         titles = ("fitted states", "held-out trials")
         parts = [

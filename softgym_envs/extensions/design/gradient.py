@@ -16,7 +16,7 @@ from softgym_envs.extensions.design.config import GradientConfig, ObjectiveConfi
 from softgym_envs.extensions.design.plots import draw_descents
 from softgym_envs.extensions.design.records import BestDesign, Descent, GradientResult
 from softgym_envs.runs import RunFolder, provenance
-from softgym_envs.storage import write_json
+from softgym_envs.storage import write_signed
 
 
 class Cost(Protocol):
@@ -140,7 +140,7 @@ def optimise(config: OptimiseConfig, folder: str | Path | None = None) -> Gradie
         return _optimise(config)[0]
     with RunFolder(folder, OptimiseConfig, "an optimisation").reserve(config, ("name", "workers")) as place:
         result, cost = _optimise(config)
-        write_json(place / "result.json", {**provenance(), **result.to_json()})
+        write_signed(place / "result.json", {**provenance(), **result.to_json()})
         ends = [cost.box.unit(descent.end) for descent in result.descents]
         with torch.no_grad():
             reached = cost.metrics(cost.box.values(torch.tensor(np.array(ends)))).numpy()

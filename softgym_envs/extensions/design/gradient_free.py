@@ -21,7 +21,7 @@ from softgym_envs.extensions.design.config import OptimiseConfig, SearchConfig
 from softgym_envs.extensions.design.plots import draw_front
 from softgym_envs.extensions.design.records import FrontDesign, SearchResult
 from softgym_envs.runs import RunFolder
-from softgym_envs.storage import atomic_write, write_json
+from softgym_envs.storage import atomic_write, write_signed
 from softgym_envs.wording import counted
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ def search(config: OptimiseConfig, folder: str | Path, *, progress: bool = True)
 
             run_search(ledger, evaluate)
         result, values, front = ledger.result()
-        write_json(place / "result.json", {**run.stamp(), **result.to_json()})
+        write_signed(place / "result.json", {**run.stamp(), **result.to_json()})
         ledger.write_table(place / "trials.csv")
         draw_front(place / "front.png", [o.find() for o in config.objectives], values, front)
     return result

@@ -21,7 +21,7 @@ from softgym_envs.extensions.design.config import SensitivityConfig
 from softgym_envs.extensions.design.plots import draw_sensitivity
 from softgym_envs.extensions.design.records import SensitivityResult
 from softgym_envs.runs import RunFolder
-from softgym_envs.storage import JsonLines, write_json
+from softgym_envs.storage import JsonLines, write_signed
 
 Table = dict[str, dict[str, float]]
 """Indices by variable."""
@@ -182,7 +182,7 @@ def analyse_sensitivity(config: SensitivityConfig, folder: str | Path, *, progre
     run = RunFolder(folder, SensitivityConfig, "a sensitivity study")
     with run.reserve(config, may_change, progress=progress) as place:
         result = _analyse(config, place, progress)
-        write_json(place / "result.json", {**run.stamp(), **result.to_json()})
+        write_signed(place / "result.json", {**run.stamp(), **result.to_json()})
         metrics = [find_metric(name) for name in config.metrics]
         draw_sensitivity(place / "sensitivity.png", config.method, metrics, result.indices)
     return result

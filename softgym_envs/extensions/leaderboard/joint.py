@@ -17,7 +17,7 @@ from softgym_envs.codesign.parts import JointConfig
 from softgym_envs.extensions.leaderboard.clock import working_seconds
 from softgym_envs.extensions.leaderboard.frozen import FrozenProblem
 from softgym_envs.extensions.leaderboard.problem import JudgedScore
-from softgym_envs.storage import read_json
+from softgym_envs.storage import read_signed
 
 STEPS = 20_000
 """Environment steps of a joint training, unless the budget allows fewer."""
@@ -117,7 +117,7 @@ class JointOptimiser:
         settings: dict[str, Any] = {"warmup": min(WARM_UP, steps // 4)}
         proposer = PROPOSERS[self._proposer](**settings)
         train(config, folder.path / "training", proposer=proposer, progress=False)
-        found = read_json(folder.path / "training" / "bodies.json")
+        found = read_signed(folder.path / "training" / "bodies.json")
         self._charge = steps + whole, working_seconds() - began
         order = [found["names"].index(name) for name in self._problem.variables]
         # A search by the critic ends in a corner of the box again and again.

@@ -255,7 +255,7 @@ def test_an_interrupted_sensitivity_study_continues(tmp_path):
     (tmp_path / "evaluations.jsonl").write_bytes(b"".join(records[:3]) + records[3][:20])
     assert analyse_sensitivity(config, tmp_path, progress=False).indices == result.indices
     assert (tmp_path / "evaluations.jsonl").read_bytes().count(b"\n") == 7
-    assert json.loads((tmp_path / "result.json").read_text())["indices"] == result.indices
+    assert read_signed(tmp_path / "result.json")["indices"] == result.indices
     assert (tmp_path / "sensitivity.png").read_bytes().startswith(b"\x89PNG")
     with pytest.raises(ConfigError, match="holds a sensitivity study with metrics"):
         analyse_sensitivity(study("oat"), tmp_path, progress=False)
