@@ -19,12 +19,23 @@ PAGES = (
     "inverse_qp",
 )
 """Pages that are notebooks as well; all their code runs from top to bottom."""
+INSTALL = """# Installs the suite where it is missing, such as on Colab. The build of torch for CPUs saves gigabytes.
+import importlib.util
+import subprocess
+import sys
+
+if importlib.util.find_spec("softgym_envs") is None:
+    pip = [sys.executable, "-m", "pip", "install", "--quiet"]
+    if importlib.util.find_spec("torch") is None:
+        subprocess.run([*pip, "torch", "--index-url", "https://download.pytorch.org/whl/cpu"], check=True)
+    subprocess.run([*pip, "softgym-envs[all]"], check=True)"""
+"""First cell of each notebook."""
 _BLOCK = re.compile(r'^```python(?: title="([^"]+)")?\n(.*?)^```$', flags=re.MULTILINE | re.DOTALL)
 
 
 def notebook(page: Path) -> str:
     """Return a page as a notebook in format 4, as JSON."""
-    text, cells, end = page.read_text(), [], 0
+    text, cells, end = page.read_text(), [_cell("code", INSTALL)], 0
     for match in _BLOCK.finditer(text):
         cells.append(_cell("markdown", text[end : match.start()]))
         # A block with a title is a file that later blocks import.

@@ -170,12 +170,35 @@ def test_defects_of_a_page_are_found():
 
 
 def test_notebooks_hold_the_code_of_their_pages():
-    for path, text in importlib.import_module("site_notebooks").notebooks().items():
-        cells = json.loads(text)["cells"]
+    module = importlib.import_module("site_notebooks")
+    for path, text in module.notebooks().items():
+        first, *cells = json.loads(text)["cells"]
+        assert first["source"] == module.INSTALL
         blocks = code_blocks((DOCS / path).with_suffix(".md"))
         expected = [(f"%%writefile {title}\n" if title else "") + block.strip("\n") for title, block, _ in blocks]
         assert [cell["source"] for cell in cells if cell["cell_type"] == "code"] == expected
         assert any(cell["cell_type"] == "markdown" for cell in cells)
+
+
+def test_the_first_cell_of_notebooks_installs_what_is_missing(monkeypatch):
+    install = importlib.import_module("site_notebooks").INSTALL
+    asked, missing = [], {"softgym_envs", "torch"}
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name in missing else object())
+    monkeypatch.setattr("subprocess.run", lambda command, check: asked.append(command[5:]))
+    exec(install, {})
+    assert [command[0] for command in asked] == ["torch", "softgym-envs[all]"]
+    missing.clear()
+    exec(install, {})
+    assert len(asked) == 2
+
+
+def test_the_page_for_assistants_leads_to_pages_of_the_site():
+    text = (DOCS / "llms.txt").read_text()
+    links = re.findall(r"\]\(([\w/.-]+)\)", text)
+    assert len(links) > 15 and text.startswith("# softgym-envs\n\n> ")
+    generated = {"environments/index.md", "robots/index.md", "reference/index.md"}
+    for link in links:
+        assert (DOCS / link).is_file() or link in generated, link
 
 
 @pytest.mark.parametrize(

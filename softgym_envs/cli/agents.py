@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 @options.run_options("agents")
 @options.folder
 @click.option("--initial", type=options.PATH, help="Policy file to start from.")
-def train(config: Path, folder: Path, initial: Path | None, quiet: bool, overrides: tuple[str, ...]) -> None:
+def train(config: Path, folder: Path, initial: Path | None, quiet: bool, overrides: tuple[str, ...]) -> dict[str, str]:
     """Train a policy with the learner that the configuration names.
 
     An interrupted run continues from its last checkpoint. In the same folder, more steps (steps=80000) extend a
@@ -43,6 +43,7 @@ def train(config: Path, folder: Path, initial: Path | None, quiet: bool, overrid
         click.echo(f"{path} is finished after {wanted.steps} steps; a larger steps=... trains on")
     else:
         click.echo(f"wrote {path}")
+    return {"policy": str(path)}
 
 
 @click.command()

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+import json
 import os
 import re
 import sys
+from collections.abc import Sequence
 from typing import NoReturn
 
 import click
@@ -17,6 +21,9 @@ from softgym_envs.version import __version__
 
 ALLOW = "--allow-code"
 """Flag of all verbs: files may name code, and the current folder is on the search path."""
+
+JSON = "--json"
+"""Flag of all verbs: print one line of JSON. Verbs without an option of this name print what `_print_json` says."""
 
 SECTIONS = {
     "Environments": {
@@ -89,7 +96,8 @@ def cli(ctx: click.Context) -> None:
     """Optimise the body and the controller of a soft robot together.
 
     Files name robots, tasks, metrics, ... that are registered. With --allow-code, in any place, they may also name
-    code of yours as module:name, which is looked up in the current folder too.
+    code of yours as module:name, which is looked up in the current folder too. With --json, every verb prints one line
+    of JSON; one that has no --json of its own prints its result, if it has one, and the lines that people would read.
     """
     if ctx.invoked_subcommand is None:
         click.echo(ctx.get_help())
@@ -106,6 +114,9 @@ def main() -> None:
         os.environ.setdefault(variable, "1")
     threadpool_limits(1)
     arguments = [argument for argument in sys.argv[1:] if argument != ALLOW]
+    as_json = JSON in arguments and not _has_own_json(arguments)
+    if as_json:
+        arguments.remove(JSON)
     named = [word for argument in arguments for word in re.split(r"[=,\[\]{}\s]+", argument) if is_place(word)]
     allow_code(*named, *(["1"] if ALLOW in sys.argv else []))
     if named or ALLOW in sys.argv:
@@ -113,7 +124,10 @@ def main() -> None:
         # search path, files in it cannot replace modules of the suite.
         sys.path.append(os.getcwd())
     try:
-        cli(arguments, prog_name="softgym", standalone_mode=False)
+        if as_json:
+            _print_json(arguments)
+        else:
+            cli(arguments, prog_name="softgym", standalone_mode=False)
     except click.exceptions.Exit as leave:
         sys.exit(leave.exit_code)
     except (click.Abort, KeyboardInterrupt) as stop:
@@ -131,6 +145,25 @@ def main() -> None:
         if hasattr(error, "__notes__"):  # an error in a robot's code, annotated by `Robot.build`
             raise
         _fail(_described(error))
+
+
+def _has_own_json(arguments: Sequence[str]) -> bool:
+    """Return whether the verb of some arguments, or of a group in it, has an option `JSON`."""
+    command: click.Command | None = cli
+    context = click.Context(cli)
+    for argument in arguments:
+        if not isinstance(command, click.Group) or command.get_command(context, argument) is None:
+            break
+        command = command.get_command(context, argument)
+    return command is not None and any(JSON in parameter.opts for parameter in command.params)
+
+
+def _print_json(arguments: Sequence[str]) -> None:
+    """Run a verb and print ``{"verb": ..., "result": ..., "lines": [...]}``: what it returns, and what it says."""
+    with contextlib.redirect_stdout(io.StringIO()) as said:
+        result = cli(list(arguments), prog_name="softgym", standalone_mode=False)
+    document = {"verb": arguments[0] if arguments else None, "result": result, "lines": said.getvalue().splitlines()}
+    click.echo(json.dumps(document, default=str))
 
 
 def _described(error: Exception) -> str:

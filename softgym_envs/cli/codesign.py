@@ -22,7 +22,7 @@ def codesign(
     storage: str | None,
     quiet: bool,
     overrides: tuple[str, ...],
-) -> None:
+) -> dict[str, str]:
     """Optimise body and controller together and write a report.
 
     The report is FOLDER/report.html. An interrupted study continues where it stopped.
@@ -41,3 +41,4 @@ def codesign(
             click.echo("drawing the report: finite elements compute what baseline and winner do at one goal")
         report = write_report(folder)
     click.echo(f"report: {report}")
+    return {"folder": str(folder), "report": str(report)}

@@ -14,7 +14,7 @@ from softgym_envs.storage import atomic_write
 
 @click.command()
 @click.option("--copy", type=options.PATH, metavar="FOLDER", help="Copy them all to this new folder, to edit them.")
-def configs(copy: Path | None) -> None:
+def configs(copy: Path | None) -> dict[str, list[str]] | None:
     """List the shipped configurations, or copy them.
 
     Every verb with --config accepts their names.
@@ -24,7 +24,7 @@ def configs(copy: Path | None) -> None:
             click.echo(f"{verbs}:")
             for name in shipped_configs(folder):
                 click.echo(f"  {name}")
-        return
+        return {folder: list(shipped_configs(folder)) for folder in options.VERBS}
     if copy.exists():
         raise ConfigError(f"'{copy}' exists; choose a new folder for the configurations")
     for folder in options.VERBS:
@@ -35,3 +35,4 @@ def configs(copy: Path | None) -> None:
         with atomic_write(copy / path.relative_to(CONFIGS)) as stream:
             stream.write(path.read_bytes())
     click.echo(f"wrote {copy}")
+    return None

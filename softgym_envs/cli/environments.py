@@ -154,7 +154,7 @@ def rollout(
     paraview: Path | None,
     glb: Path | None,
     **chosen: Any,
-) -> None:
+) -> dict[str, Any]:
     """Run one episode and print its result.
 
     ENVIRONMENT is an ID (softgym list), or module:ID as for Gymnasium. Without one, --robot, --config or the policy of
@@ -214,6 +214,7 @@ def rollout(
     if glb is not None:
         click.echo(f"wrote {glb}")
     env.close()
+    return {**summary, "backend": config.backend, "seed": seed}
 
 
 @click.command()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -85,7 +86,7 @@ def optimise(config: Path, folder: Path | None, quiet: bool, overrides: tuple[st
 @options.config("design")
 @options.results_folder
 @options.overrides
-def calibrate(config: Path, folder: Path | None, overrides: tuple[str, ...]) -> None:
+def calibrate(config: Path, folder: Path | None, overrides: tuple[str, ...]) -> dict[str, Any]:
     """Fit design variables to measured states in a CSV or JSON file."""
     require("codesign")
     from softgym_envs.config import load_config
@@ -113,3 +114,4 @@ def calibrate(config: Path, folder: Path | None, overrides: tuple[str, ...]) -> 
     if result.held_out_errors:
         errors += "; held out: " + ", ".join(f"{name} {value:.3g}" for name, value in result.held_out_errors.items())
     click.echo(f"root mean square errors: {errors} (SI units); {result.seconds:.1f} s; wrote {folder}")
+    return result.to_json()
