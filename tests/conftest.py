@@ -17,6 +17,7 @@ from hypothesis import settings
 from softgym_envs import make_robot
 from softgym_envs.cli import main
 from softgym_envs.mechanics.compilation import ANNOUNCED
+from softgym_envs.mechanics.locking import locking_accepted
 from softgym_envs.mechanics.materials import MATERIALS
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
@@ -93,6 +94,13 @@ def pytest_runtest_protocol(item):
 
 
 # -- fixtures -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="session", autouse=True)
+def coarse_bodies():
+    """Tests use coarse elements on coarse meshes on purpose; tests/mechanics/test_locking.py tests the warning."""
+    with locking_accepted():
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -15,6 +15,7 @@ import softgym_envs  # noqa: F401 - registers the environments
 from softgym_envs import DesignSpace, DesignVariable, make_robot, unchecked
 from softgym_envs.agents.config import EnvironmentConfig
 from softgym_envs.backends import make_backend
+from softgym_envs.backends.backend import PointForce
 from softgym_envs.config import load_config
 from softgym_envs.extensions.sensing.loads import Payload, Touch, finger_grid
 from softgym_envs.mechanics import MechanicalModel
@@ -48,6 +49,20 @@ class Bar(Robot):
         route = self.scale * np.linspace([0.005, 0.01, 0.017], [0.095, 0.01, 0.017], 4)
         model.add_cable("pull", route, self.scale * np.array([-0.001, 0.01, 0.017]))
         model.add_effector("tip", self.scale * np.array([0.1, 0.01, 0.01]))
+        return model
+
+
+class Loaded(Bar):
+    """The bar with a rigid part whose mass was given in grams."""
+
+    def assemble(self, design):
+        builder = ModelBuilder(gravity=self.gravity)
+        builder.add_solid(NODES, TETRAHEDRA, fixed=NODES[:, 0] == 0.0, young_modulus=design["young_modulus"])
+        frame = builder.add_frame([0.1, 0.01, 0.01])
+        builder.add_mass(frame, 20.0, np.eye(3) * 1e-3)
+        model = builder.build()
+        model.add_cable("pull", np.linspace([0.005, 0.01, 0.017], [0.095, 0.01, 0.017], 4), [-0.001, 0.01, 0.017])
+        model.add_effector("tip", [0.1, 0.01, 0.01])
         return model
 
 
@@ -178,6 +193,30 @@ MISTAKES = {
     "payload in g": (
         lambda _: make_robot("tetrapod", payload=1000.0),
         "robot 'tetrapod': payload = 1000 kg *(1000 g)?*",
+    ),
+    "payload of some grams": (
+        lambda _: make_robot("tetrapod", payload=10.0),
+        "robot 'tetrapod': payload = 10 kg *lift*; did you mean 0.01 kg (10 g)?*",
+    ),
+    "mass of a rigid part in g": (
+        lambda _: Loaded().build(),
+        "robot 'bar': mass of a rigid part = 20 kg *; did you mean 0.02 kg (20 g)?*",
+    ),
+    "force of a step in mN": (
+        lambda _: make_backend("fem", Bar()).step([0.0], force=[0.0, 0.0, 100.0]),
+        "force = 100 N *ten times what its actuators can do*; did you mean 0.1 N (100 mN)?*",
+    ),
+    "force of a step in mN, though the actuators are strong": (
+        lambda _: make_backend("fem", make_robot("finger")).step(np.zeros(2), force=[0.0, 300.0, 0.0]),
+        "force = 300 N *moves its effector by 10 sizes*; did you mean 0.3 N (300 mN)?*",
+    ),
+    "force of a touch in mN": (
+        lambda _: make_backend("fem", Bar()).touch(PointForce([0.1, 0.01, 0.01], [0.0, 0.0, -100.0])),
+        "force of a touch = -100 N *; did you mean -0.1 N (-100 mN)?*",
+    ),
+    "effort in mN": (
+        lambda _: make_backend("fem", Bar()).step([900.0], "effort"),
+        "effort of actuator 'pull' = 900 N *; did you mean 0.9 N (900 mN)?*",
     ),
     "object's mass in g": (
         lambda _: make_robot("two_finger_friction_gripper", object_mass=50.0),

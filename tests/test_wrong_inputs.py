@@ -70,7 +70,7 @@ class Leg(Robot):
 
 def carried(_):
     builder = ModelBuilder()
-    builder.add_solid(NODES, TETRAHEDRA, fixed=NODES[:, 0] == 0.0)
+    builder.add_solid(NODES, TETRAHEDRA, fixed=NODES[:, 0] == 0.0, element="linear")
     builder.carry(builder.add_frame([0.1, 0.01, 0.01]), NODES[:, 0] == 0.1)
 
 

@@ -11,7 +11,9 @@ import numpy as np
 
 from softgym_envs.designs import Design
 from softgym_envs.mechanics.condensation import CondensedModel
+from softgym_envs.quantities import check_quantity
 from softgym_envs.robots.base import Robot
+from softgym_envs.robots.checks import plausible_force
 
 if TYPE_CHECKING:
     from softgym_envs.mechanics.contact.contact import Contacts
@@ -19,6 +21,12 @@ if TYPE_CHECKING:
 
 #: A displacement this many times as large as the bounds of its actuator is taken for a mistake in its unit.
 FAR_BEYOND = 10.0
+
+#: An effort of this many times the typical one of its actuator is taken for a mistake in its unit.
+STRONG = 100.0
+
+#: A force that would move the effector by this many sizes of its robot is taken for a mistake in its unit.
+FAR_MOVED = 10.0
 
 
 class _Evaluated:
@@ -151,16 +159,69 @@ def check_command(robot: Robot, command: object, mode: str) -> np.ndarray:
 
     Raises:
         ValueError: unless it is one finite number for each actuator; also for a displacement so far beyond the range of
-            its actuator that its unit is probably wrong.
+            its actuator, or an effort so far beyond what is typical of it, that its unit is probably wrong.
     """
     array = check_numbers("command", command, len(robot.actuators))
+    if mode == "effort":
+        for actuator, value, typical in zip(robot.actuators, array.tolist(), robot.effort_scale.tolist(), strict=True):
+            if abs(value) > STRONG * typical:
+                check_quantity(
+                    "pressure" if actuator.unit == "m3" else "force",
+                    value,
+                    f"effort of actuator '{actuator.name}'",
+                    high=STRONG * typical,
+                    example=f"{STRONG:g} times effort_scale of robot '{robot.name}'",
+                )
+        return array
     for actuator, value in zip(robot.actuators, array.tolist(), strict=True):
-        if mode == "displacement" and abs(value) > FAR_BEYOND * max(abs(actuator.low), abs(actuator.high)):
+        if abs(value) > FAR_BEYOND * max(abs(actuator.low), abs(actuator.high)):
             raise ValueError(
                 f"command = {value:g} {actuator.unit} of actuator '{actuator.name}' is far beyond its range of "
                 f"{actuator.low:g} to {actuator.high:g} {actuator.unit}; check its unit"
             )
     return array
+
+
+def check_force(robot: Robot, rest: State, force: object, name: str = "force") -> np.ndarray:
+    """Return a force on a body as an array (3,).
+
+    Args:
+        robot: the robot.
+        rest: of the body; its compliance says what force is plausible.
+        force: [N].
+        name: of the force, for messages.
+
+    Raises:
+        ValueError: unless it is three finite numbers; also for a force so large that its unit is probably wrong.
+    """
+    array = check_numbers(name, force, 3)
+    largest = float(np.abs(array).max())
+    if not largest:
+        return array
+    high, why = plausible_force(robot), "ten times what its actuators can do"
+    if rest.contacts is None:  # what contact holds at rest may be free
+        condensed = rest.condensed
+        a, e, W = condensed.slices["a"], condensed.slices["e"], condensed.compliance
+        held = W[e, e] - W[e, a] @ np.linalg.lstsq(W[a, a], W[a, e], rcond=None)[0]
+        compliance = float(np.linalg.norm(held[:3, :3], 2))
+        if compliance * high > FAR_MOVED * robot.size:
+            high, why = FAR_MOVED * robot.size / compliance, f"which moves its effector by {FAR_MOVED:g} sizes"
+    check_quantity("force", array, name, high=high, example=f"for robot '{robot.name}', {why}")
+    return array
+
+
+def check_touch(robot: Robot, rest: State, load: object) -> PointForce | None:
+    """Return what touches a body at rest, after checking it as `check_force` does.
+
+    Raises:
+        ValueError: unless it is a `PointForce` or None, and the force is plausible.
+    """
+    if load is None:
+        return None
+    if not isinstance(load, PointForce):
+        raise ValueError(f"touch = {load!r} must be a PointForce(point=..., force=...) or None")
+    check_force(robot, rest, load.force, "force of a touch")
+    return load
 
 
 def refuse_force(force: np.ndarray | None) -> None:
@@ -236,7 +297,8 @@ class Backend(ABC):
         """Touch the body at a point from the next `step` on, or no longer; `reset` ends a touch.
 
         Raises:
-            ValueError: for a point outside the body, or if the backend takes no forces.
+            ValueError: for a point outside the body, a force that is probably in another unit, or if the backend takes
+                no forces.
         """
         raise ValueError(f"{type(self).__name__} takes no forces")
 

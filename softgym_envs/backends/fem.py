@@ -8,7 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from softgym_envs.backends.backend import Backend, PointForce, Snapshot, State, check_command, check_numbers
+from softgym_envs.backends.backend import (
+    Backend,
+    PointForce,
+    Snapshot,
+    State,
+    check_command,
+    check_force,
+    check_touch,
+)
 from softgym_envs.backends.time_steps import TimeSteps, check_still
 from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError
@@ -151,6 +159,7 @@ class FEMBackend(Backend):
         return self.robot.build(design)
 
     def touch(self, load: PointForce | None) -> None:
+        load = check_touch(self.robot, self._rest, load)
         loads = self._own_loads.copy()
         if load is not None:
             at = self.model.embed(load.point, radius=TOUCH_RADIUS)
@@ -245,7 +254,7 @@ class FEMBackend(Backend):
         load = None
         if force is not None:
             load = np.zeros(self.state.effector.size)
-            load[:3] = check_numbers("force", force, 3)
+            load[:3] = check_force(self.robot, self._rest, force)
         kept = self._motion
         try:
             if self._dynamics is None:

@@ -9,7 +9,15 @@ from pathlib import Path
 
 import numpy as np
 
-from softgym_envs.backends.backend import Backend, PointForce, Snapshot, State, check_command, refuse_force
+from softgym_envs.backends.backend import (
+    Backend,
+    PointForce,
+    Snapshot,
+    State,
+    check_command,
+    check_touch,
+    refuse_force,
+)
 from softgym_envs.backends.batch import BatchBackend, BatchState
 from softgym_envs.backends.surrogate_motion import MotionState, SurrogateMotion
 from softgym_envs.backends.time_steps import TimeSteps, check_still
@@ -351,6 +359,7 @@ class SurrogateBackend(Backend):
     def touch(self, load: PointForce | None) -> None:
         if load is self._touch:
             return
+        load = check_touch(self.robot, self._rest, load)
         if load is None:
             self._body = self._untouched
         else:

@@ -12,6 +12,8 @@ from softgym_envs.mechanics.elements.beams import Beam, Section
 from softgym_envs.mechanics.elements.block import ElementBlock
 from softgym_envs.mechanics.elements.rigid import RigidBody
 from softgym_envs.mechanics.frames import frame_rows
+from softgym_envs.mechanics.locking import warn_of_locking
+from softgym_envs.mechanics.mesh_checks import check_apart
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.rods import ENDS, Rod, outlines, straight_places, transported_frames
 from softgym_envs.mechanics.skins import tube_skin
@@ -40,6 +42,7 @@ class ModelBuilder:
         self._carried: dict[int, np.ndarray] = {}
         self._mounted: dict[int, list[int]] = {}
         self._parts: list[tuple[type[ElementBlock], np.ndarray, dict[str, object]]] = []
+        self._solids: list[np.ndarray] = []  # corners of those that may not overlap
         self._rods: list[tuple[int, np.ndarray, np.ndarray | None]] = []  # part, places of frames, outlines
         self.size = 0
 
@@ -56,9 +59,14 @@ class ModelBuilder:
         return np.vstack(self._rows) if self._rows else np.empty((0, 3))
 
     def add_solid(self, nodes: np.ndarray, tetrahedra: np.ndarray, *, fixed: Fixed, **options: Any) -> int:
-        """Add a solid body; arguments as for `MechanicalModel.from_mesh`, without gravity and solver."""
+        """Add a solid body; arguments as for `MechanicalModel.from_mesh`, without gravity and solver.
+
+        With ``check=False`` the body may also overlap other solids.
+        """
         part = solid_part(nodes, tetrahedra, fixed=fixed, **options)
         start = self._append(part.nodes, part.fixed)
+        if options.get("check", True):
+            self._solids.append(part.connectivity[:, :4] + start)
         self._parts.append((part.kind, part.connectivity + start, part.options))
         return start
 
@@ -198,8 +206,13 @@ class ModelBuilder:
         self._parts.append((RigidBody, np.array(frame), {"mass": mass, "inertia": inertia}))
 
     def build(self) -> MechanicalModel:
-        """Return the model, with its blocks in the order in which they were added."""
+        """Return the model, with its blocks in the order in which they were added.
+
+        Raises:
+            InfeasibleDesign: if two solids overlap.
+        """
         nodes = self.nodes
+        check_apart(nodes, self._solids)
         blocks = [kind(nodes, topology, **options) for kind, topology, options in self._parts]  # type: ignore[call-arg]
         model = MechanicalModel(
             nodes,
@@ -219,4 +232,5 @@ class ModelBuilder:
             model.rods.append(Rod(beam, places))
             if outline is not None:
                 model.skins.append(tube_skin(beam, nodes, outline))
+        warn_of_locking(model)
         return model

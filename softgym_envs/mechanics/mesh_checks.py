@@ -12,6 +12,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from softgym_envs.errors import InfeasibleDesign
 from softgym_envs.mechanics.compilation import njit
 from softgym_envs.mechanics.elements.tetrahedra import FACES, boundary_triangles, orient_corners
 
@@ -62,13 +63,45 @@ def check_mesh(nodes: np.ndarray, tetrahedra: np.ndarray) -> None:
             " the body comes apart there; merge them with merge_nodes, or pass check=False for a cut that is meant"
         )
     corners = nodes[tetrahedra]
-    i, j = _first_overlap(corners, tetrahedra, _order(corners), _DEPTH)
+    i, j = _first_overlap(corners, tetrahedra, np.arange(len(corners)), _order(corners), _DEPTH)
     if i >= 0:
         raise ValueError(
             f"tetrahedra {i} and {j} overlap near {_place(0.5 * (middles[i] + middles[j]))}: both would carry load "
             "there; unite the parts before meshing"
         )
     _check_seams(nodes, boundary_triangles(tetrahedra), tetrahedra)
+
+
+def check_apart(nodes: np.ndarray, solids: Sequence[np.ndarray]) -> None:
+    """Check that solids of one model do not overlap; they may touch.
+
+    Args:
+        nodes: [m], shape (n, 3).
+        solids: corner indices of the tetrahedra of each, shapes (m, 4).
+
+    Raises:
+        InfeasibleDesign: with the place.
+    """
+    boxes = [(nodes[solid].min(axis=(0, 1)), nodes[solid].max(axis=(0, 1))) for solid in solids]
+    for k, (low, high) in enumerate(boxes):
+        for other in range(k):
+            bottom, top = np.maximum(low, boxes[other][0]), np.minimum(high, boxes[other][1])
+            if (bottom >= top).any():
+                continue
+            near = [
+                each[((nodes[each].max(axis=1) > bottom) & (nodes[each].min(axis=1) < top)).all(axis=1)]
+                for each in (solids[other], solids[k])
+            ]
+            cells, part = np.concatenate(near), np.repeat([0, 1], [len(each) for each in near])
+            corners = nodes[cells]
+            middles = corners.mean(axis=1)
+            i, j = _first_overlap(corners, cells, part, _order(corners), _DEPTH)
+            if i >= 0:
+                raise InfeasibleDesign(
+                    f"solids {other} and {k} of the model overlap near {_place(0.5 * (middles[i] + middles[j]))}: both "
+                    "would carry load there; move them apart, unite them before meshing, or pass check=False to "
+                    "add_solid if that is meant"
+                )
 
 
 def merge_nodes(nodes: np.ndarray, tetrahedra: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -223,8 +256,8 @@ def _bounds(corners, low, high):
 
 
 @njit(cache=True, error_model="numpy")
-def _first_overlap(corners, tetrahedra, order, depth):
-    """Two tetrahedra that overlap, or (-1, -1); corners (m, 4, 3) in ``order`` along the first axis.
+def _first_overlap(corners, tetrahedra, part, order, depth):
+    """Two tetrahedra of different parts (m,) that overlap, or (-1, -1); corners (m, 4, 3) in ``order`` along axis 0.
 
     Those that share a face are on different sides of it, which has been checked.
     """
@@ -238,6 +271,8 @@ def _first_overlap(corners, tetrahedra, order, depth):
             j = order[n]
             if low[j, 0] >= high[i, 0]:
                 break
+            if part[i] == part[j]:
+                continue
             if low[j, 1] >= high[i, 1] or low[i, 1] >= high[j, 1] or low[j, 2] >= high[i, 2] or low[i, 2] >= high[j, 2]:
                 continue
             common = 0

@@ -198,7 +198,7 @@ class MechanicalModel:
         block = part.kind(part.nodes, part.connectivity, **part.options)
         model = cls(part.nodes, [block], fixed=part.fixed, gravity=gravity, solver=solver)
         model._check_held()
-        warn_of_locking(model, element)
+        warn_of_locking(model)
         return model
 
     @classmethod

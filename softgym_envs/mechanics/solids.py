@@ -18,9 +18,7 @@ from softgym_envs.mechanics.mesh_checks import check_mesh
 from softgym_envs.quantities import check_quantity
 
 SOLIDS: dict[str, type[SolidBlock]] = {
-    "linear": Tetrahedra,
-    "averaged": AveragedTetrahedra,
-    "quadratic": QuadraticTetrahedra,
+    kind.element: kind for kind in (Tetrahedra, AveragedTetrahedra, QuadraticTetrahedra)
 }
 """Solid elements by name."""
 
@@ -58,7 +56,7 @@ def solid_part(
     tetrahedra: np.ndarray,
     *,
     fixed: Fixed,
-    element: str = "linear",
+    element: str = DEFAULT_ELEMENT,
     young_modulus: PerElement = 3.0e6,
     poisson_ratio: PerElement = 0.3,
     total_mass: float | None = None,

@@ -14,6 +14,7 @@ from softgym_envs.mechanics.compilation import njit
 from softgym_envs.mechanics.constraints.cavity import Cavity, SealedAir, enclosed_volume
 from softgym_envs.mechanics.constraints.constraint import Constraint
 from softgym_envs.mechanics.elements.gas import EnclosedGas
+from softgym_envs.mechanics.elements.quadratic import split_triangles
 from softgym_envs.mechanics.elements.tetrahedra import boundary_triangles
 
 MechanicalModel = Any
@@ -185,8 +186,11 @@ def _pierces(start, end, a, b, c, tolerance):
 
 
 @njit(cache=True, error_model="numpy")
-def _first_crossing(points, triangles, axis, tolerance):
-    """Two triangles that cross each other, or (-1, -1); they are compared in their order along an axis."""
+def _first_crossing(points, triangles, first, axis, tolerance):
+    """Two triangles that cross each other, one of them among the ``first`` ones, or (-1, -1).
+
+    They are compared in their order along an axis.
+    """
     count = triangles.shape[0]
     low, high = np.empty((count, 3)), np.empty((count, 3))
     for t in range(count):
@@ -195,11 +199,27 @@ def _first_crossing(points, triangles, axis, tolerance):
             e = (axis + d) % 3
             p, q, r = points[a, e], points[b, e], points[c, e]
             low[t, d], high[t, d] = min(p, min(q, r)), max(p, max(q, r))
-    order = np.argsort(low[:, 0])
-    for m in range(count):
+    bottom, top = np.full(3, np.inf), np.full(3, -np.inf)  # of the first ones: what lies beyond crosses none of them
+    for t in range(first):
+        for d in range(3):
+            bottom[d], top[d] = min(bottom[d], low[t, d]), max(top[d], high[t, d])
+    near = np.empty(count, dtype=np.int64)
+    found = 0
+    for t in range(count):
+        apart = False
+        for d in range(3):
+            apart = apart or low[t, d] > top[d] or high[t, d] < bottom[d]
+        near[found] = t
+        found += not apart
+    near = near[:found]
+    order = near[np.argsort(low[near, 0])]
+    chosen, passed = order[order < first], 0
+    for m in range(found):
         i = order[m]
-        for n in range(m + 1, count):
-            j = order[n]
+        passed += i < first
+        others, start = (order, m + 1) if i < first else (chosen, passed)
+        for n in range(start, others.shape[0]):
+            j = others[n]
             if low[j, 0] > high[i, 0]:
                 break
             if low[j, 1] > high[i, 1] or low[i, 1] > high[j, 1] or low[j, 2] > high[i, 2] or low[i, 2] > high[j, 2]:
@@ -210,21 +230,29 @@ def _first_crossing(points, triangles, axis, tolerance):
                 common += p == triangles[j, 0] or p == triangles[j, 1] or p == triangles[j, 2]
             if common >= 2:  # every edge begins or ends on the other triangle, and so only touches it
                 continue
-            for first, second in ((i, j), (j, i)):
-                u0, u1, u2 = triangles[second]
+            for one, other in ((i, j), (j, i)):
+                u0, u1, u2 = triangles[other]
                 for k in range(3):
-                    p, q = triangles[first, k], triangles[first, (k + 1) % 3]
+                    p, q = triangles[one, k], triangles[one, (k + 1) % 3]
                     if p != u0 and p != u1 and p != u2 and q != u0 and q != u1 and q != u2:
                         if _pierces(points[p], points[q], points[u0], points[u1], points[u2], tolerance):
                             return i, j
     return -1, -1
 
 
+def _crossing(points: np.ndarray, triangles: np.ndarray, first: int) -> tuple[int, int, np.ndarray] | None:
+    """Return two triangles that cross, one of them among the ``first`` ones, and a point [m] (3,) there, or None."""
+    axis = int(np.argmax(np.ptp(points[triangles[:, 0]], axis=0)))  # few triangles overlap along the longest side
+    i, j = _first_crossing(points, triangles, first, axis, 1e-9)
+    if i < 0:
+        return None
+    return i, j, 0.5 * (points[triangles[i]].mean(axis=0) + points[triangles[j]].mean(axis=0))
+
+
 def self_intersection(points: np.ndarray, triangles: np.ndarray) -> np.ndarray | None:
     """Return a point [m] (3,) where triangles (k, 3) cross each other, or None. Touching is allowed."""
-    axis = int(np.argmax(np.ptp(points[triangles[:, 0]], axis=0)))  # few triangles overlap along the longest side
-    i, j = _first_crossing(points, triangles, axis, 1e-9)
-    return None if i < 0 else 0.5 * (points[triangles[i]].mean(axis=0) + points[triangles[j]].mean(axis=0))
+    found = _crossing(points, triangles, len(triangles))
+    return None if found is None else found[2]
 
 
 @njit(cache=True, error_model="numpy")
@@ -243,15 +271,30 @@ def _inside_out(x, tetrahedra):
 class ShapeCheck:
     """Whether a state can be one: no wall of a cavity has passed through another, and no cell is inside out.
 
-    Elements whose Gauss points alone are kept from turning inside out are checked by their corners.
+    The walls of a cavity may not cross each other, those of another cavity, or the outside of a solid; where a pressure
+    drives the body, its outer walls may not cross each other either. Elements whose Gauss points alone are kept from
+    turning inside out are checked by their corners.
 
     Args:
-        cavities: whose walls do not touch each other in the model.
+        cavities: whose walls do not touch anything in the model.
+        outside: triangles of the boundary of solids (k, 3), which may contain those of the cavities.
         cells: corners of such elements, shapes (m, 4).
+        driven: whether the pressure of a cavity drives the body.
     """
 
-    def __init__(self, cavities: Iterable[Cavity], cells: Iterable[np.ndarray]) -> None:
-        self._cavities = [(each, np.ascontiguousarray(each.flat_triangles)) for each in cavities]
+    def __init__(
+        self, cavities: Iterable[Cavity], outside: np.ndarray, cells: Iterable[np.ndarray], *, driven: bool = False
+    ) -> None:
+        walls = [(each.name, each.flat_triangles) for each in cavities]
+        self._names = [name for name, _ in walls]
+        parts = [*(triangles for _, triangles in walls), *([outside] if walls else [])]
+        owner = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+        triangles = np.concatenate(parts) if parts else np.empty((0, 3), dtype=np.int64)
+        # A wall of several cavities, or of one and the outside, counts once.
+        _, first = np.unique(np.sort(triangles, axis=1), axis=0, return_index=True)
+        first.sort()
+        self._triangles, self._owner = np.ascontiguousarray(triangles[first]), owner[first]
+        self._first = int(len(first) if driven else (self._owner < len(walls)).sum())
         self._cells = [np.ascontiguousarray(each) for each in cells]
 
     @classmethod
@@ -263,17 +306,22 @@ class ShapeCheck:
         touching = model.contact is not None and model.contact.self_contact
         # A sliver turns inside out by less than its neighbours are strained.
         cells = [_solid_cells(model.nodes, block.corners) for block in model.solids if block.points > 1]
-        return cls([] if touching else cavities.values(), cells)
+        if touching or not cavities:
+            return cls([], np.empty((0, 3), dtype=np.int64), cells)
+        driven = any(isinstance(each, Cavity) for each in model.constraints["a"])
+        outside = np.concatenate([_boundary(block) for block in model.solids])
+        return cls(cavities.values(), outside, cells, driven=driven)
 
     def problem(self, x: np.ndarray) -> ImpossibleState | None:
-        """Return what is wrong with the rows of a state [m], shape (n, 3): the cavity or cell, and the place."""
-        for cavity, triangles in self._cavities:
-            if (place := self_intersection(x, triangles)) is not None:
-                return ImpossibleState(
-                    f"the walls of '{cavity.name}' pass through each other near {np.round(place, 4).tolist()} m, "
-                    "because they do not touch each other in this model; let them touch with "
-                    "set_contact(settings=ContactSettings(self_contact=True))"
-                )
+        """Return what is wrong with the rows of a state [m], shape (n, 3): the wall or cell, and the place."""
+        if len(self._triangles) and (found := _crossing(x, self._triangles, self._first)) is not None:
+            i, j, place = found
+            first, second = sorted((int(self._owner[i]), int(self._owner[j])))
+            return ImpossibleState(
+                f"{self._walls(first, second)} pass through each other near {np.round(place, 4).tolist()} m, because "
+                "they do not touch each other in this model; let them touch with "
+                "set_contact(settings=ContactSettings(self_contact=True))"
+            )
         for cells in self._cells:
             if (cell := _inside_out(x, cells)) >= 0:
                 place = np.round(x[cells[cell]].mean(axis=0), 4).tolist()
@@ -282,6 +330,24 @@ class ShapeCheck:
                     "over a radius"
                 )
         return None
+
+    def _walls(self, first: int, second: int) -> str:
+        """Return the name of walls of two owners."""
+        outside = len(self._names)
+        if first == outside:
+            return "outer walls of the body"
+        if first == second:
+            return f"the walls of '{self._names[first]}'"
+        other = "the outside of the body" if second == outside else f"those of '{self._names[second]}'"
+        return f"walls of '{self._names[first]}' and {other}"
+
+
+def _boundary(block: Any) -> np.ndarray:
+    """Return the boundary of a solid as flat triangles (k, 3), of quadratic elements split at their midside nodes."""
+    triangles = boundary_triangles(block.corners)
+    if block.connectivity.shape[1] == 4:
+        return triangles
+    return split_triangles(triangles, block.connectivity)
 
 
 def _solid_cells(nodes: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:

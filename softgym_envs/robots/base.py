@@ -112,6 +112,7 @@ class Robot(ABC):
         learned_parts: names of the parts that `assemble` takes from `parts`, if there are any there.
         parts: learned parts by name: functions of a design and of gravity that return the options of the element; see
             `of_parts`.
+        reproduces_scene: whether the mesh is that of a published scene, whose elements may lock; others warn once.
         non_mechanical_options: options that do not change the condensed model.
     """
 
@@ -136,6 +137,8 @@ class Robot(ABC):
     parts: Mapping[str, Callable[[Mapping[str, float], np.ndarray], dict[str, Any]]] = {}
     design_boxes: Mapping[str, Mapping[str, tuple[float, float]]] = {}
     non_mechanical_options: tuple[str, ...] = ("unilateral", "design_box")
+    reproduces_scene: bool = False
+    _has_built = False
     _options: dict[str, object]
 
     def __init_subclass__(cls, **options: object) -> None:
@@ -223,10 +226,14 @@ class Robot(ABC):
         Any other exception is an error in the robot's code, such as a ValueError for a model without the actuators and
         effectors that the class declares; a note is added that names the robot and the design.
         """
+        from softgym_envs.mechanics.locking import locking_accepted
+
         complete = self.design_space.complete(design)
         try:
             watched = WatchedDesign(complete)
-            model = self.assemble(watched)
+            with locking_accepted(self._has_built or self.reproduces_scene):
+                model = self.assemble(watched)
+            self._has_built = True
             check_built(self, model, complete)
             self._add_contact(model, watched)
             warn_unread(self, watched)

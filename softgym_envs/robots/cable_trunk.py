@@ -174,6 +174,8 @@ class CableTrunk(Robot):
         self.layers = layers
         self.rings = rings
         self.element = element
+        published = MESHES["published"]
+        self.reproduces_scene = (layers, rings, element) == (published.layers, published.rings, published.element)
         self.guide_radius = tier.guide_radius
         self.material = material
         self.strokes = (float(strokes[0]), float(strokes[1]))

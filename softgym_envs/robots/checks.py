@@ -160,7 +160,7 @@ def _check_quantities(robot: Robot) -> None:
             furthest, label = max(variable.low, variable.high, key=abs), f"{owner}design variable '{variable.name}'"
             check_quantity("length", furthest, label, high=DIMENSIONS * size, example=f"{DIMENSIONS:g} sizes")
     narrower = {
-        "mass": (CARRIED * size**3, "what a robot of its size may carry"),
+        "mass": _plausible_mass(robot),
         "contact_distance": (0.1 * size, "a tenth of the robot"),
         "length": (STROKES * size, f"{STROKES:g} sizes of the robot"),
         "force": (plausible_force(robot), "for its actuators"),
@@ -169,6 +169,14 @@ def _check_quantities(robot: Robot) -> None:
         if name in OPTIONS and _is_number(value) and not (name in CONTACT_DEFAULTS and value == CONTACT_DEFAULTS[name]):
             high, example = narrower.get(OPTIONS[name], (None, ""))
             check_quantity(OPTIONS[name], value, f"{owner}{name}", high=high, example=example)
+
+
+def _plausible_mass(robot: Robot) -> tuple[float, str]:
+    """Return the largest plausible mass that a robot carries [kg], and why, for messages."""
+    lifted, carried = plausible_force(robot) / 9.81, CARRIED * robot.size**3
+    if lifted < carried:
+        return lifted, "ten times what its actuators can lift"
+    return carried, "what a robot of its size may carry"
 
 
 def plausible_force(robot: Robot) -> float:
@@ -251,6 +259,7 @@ def check_built(robot: Robot, model: Any, design: Mapping[str, float]) -> None:
             effector far from `Robot.effector_rest`, another gravity than the robot's, or a number that is probably in
             another unit.
     """
+    from softgym_envs.mechanics.elements.rigid import RigidBody
     from softgym_envs.mechanics.model import MechanicalModel
     from softgym_envs.mechanics.solids import check_modulus, check_size
 
@@ -271,6 +280,10 @@ def check_built(robot: Robot, model: Any, design: Mapping[str, float]) -> None:
             )
     check_modulus([block.largest_young_modulus for block in model.blocks])
     check_size(model.places, f"scale what {owner} assembles to metres")
+    for block in model.blocks:
+        if isinstance(block, RigidBody):
+            high, example = CARRIED * robot.size**3, f"what a robot of size {robot.size:g} m may carry"
+            check_quantity("mass", block.mass, f"{owner}: mass of a rigid part", high=high, example=example)
     if not np.array_equal(model.gravity, robot.gravity):
         raise ValueError(
             f"{owner}: option gravity = {tuple(robot.gravity)} m/s2 has no effect: assemble builds a model with "

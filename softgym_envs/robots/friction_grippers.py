@@ -1,7 +1,8 @@
 """Grippers whose fingers hold a rigid object by friction, and can drop it.
 
 They have the fingers and the objects of `softgym_envs.robots.grippers`. There, ball joints tie the object to the
-fingers, as published. Here the object has a mass, stands on a stand, and is held by nothing but contact.
+fingers, as published. Here the object has a mass, stands on a stand, and is held by nothing but contact. No published
+scene has this, so that the first body warns of how much the linear elements of the default mesh lock.
 """
 
 from __future__ import annotations

@@ -91,6 +91,7 @@ class GmshRobot(Robot):
         tier = choose_mesh(self.meshes or {"published": MeshTier(own or 1.0, "quadratic")}, mesh)
         given: dict[str, Any] = {"size": mesh_size, "element": element, "fillet": fillet, "guide_radius": guide_radius}
         self.tier = tier.changed(self.name, **given, largest=getattr(self, "size", np.inf))
+        self.reproduces_scene = self.tier == self.meshes.get("published")
         if self.tier.fillet and not self.rounded:
             raise ValueError(f"robot '{self.name}' cannot be drawn with a fillet: fillet = {fillet!r} m must be zero")
         resolve_material(material)
@@ -241,7 +242,6 @@ class GmshRobot(Robot):
         """
         from softgym_envs.mechanics.builder import ModelBuilder
 
-        # Published scenes have linear elements, which lock: from_mesh would warn of them.
         builder = ModelBuilder(gravity=self.gravity)
         builder.add_solid(
             mesh.nodes,

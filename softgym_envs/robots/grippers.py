@@ -105,6 +105,7 @@ class FingerRobot(Robot):
         self.meshing = self.finger.meshing
         self.feature_size, self.guide_size = self.finger.feature_size, self.finger.guide_size
         self.guide_radius = self.finger.guide_radius
+        self.reproduces_scene = self.finger.reproduces_scene and not self.holds_by_contact
         self.design_space = DesignSpace(*self.variables())
         self.actuators = tuple(
             Actuator(f"finger_{k + 1}_{cable.name}", *self.cable_range, self.cable_rate, unilateral=unilateral)

@@ -46,7 +46,7 @@ def test_one_solid_is_the_model_of_its_block(box, element):
 def test_fixed_nodes_by_index_by_mask_and_by_axis(fixed):
     nodes = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     body = ModelBuilder()
-    body.add_solid(nodes, [[0, 1, 2, 3]], fixed=fixed)
+    body.add_solid(nodes, [[0, 1, 2, 3]], fixed=fixed, element="linear")
     model = body.build()
     np.testing.assert_array_equal(model.fixed, [True, True, False, True])
     np.testing.assert_array_equal(model.kinematics.free_dofs, [6, 7, 8])
@@ -144,12 +144,12 @@ def test_unknown_names_are_rejected(box):
         body.add_solid(nodes, tetrahedra, fixed=[0], element="cubic")
     with pytest.raises(ValueError, match="3 is not the first row of a frame"):
         body.carry(3, np.array([0]))
-    body.add_solid(nodes, tetrahedra, fixed=[0], material="jelly")
+    body.add_solid(nodes, tetrahedra, fixed=[0], material="jelly", element="linear")
     with pytest.raises(ValueError, match="unknown material 'jelly'"):
         body.build()
     with pytest.raises(ValueError, match="orthonormal"):
         body.add_frame([0, 0, 0], 2.0 * np.eye(3))
     nothing = ModelBuilder()
-    nothing.add_solid(nodes, tetrahedra, fixed=[])
+    nothing.add_solid(nodes, tetrahedra, fixed=[], element="linear")
     with pytest.raises(ValueError, match="no node is fixed"):
         nothing.build()

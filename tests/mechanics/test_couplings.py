@@ -159,7 +159,7 @@ def test_a_body_held_by_bonds_alone(box):
     nodes, tetrahedra = box((0.02, 0.02, 0.04), (2, 2, 3))
     body = ModelBuilder(gravity=(0.0, 0.0, -9.81))
     wall = body.add_frame([0.0, 0.0, 0.0], fixed=True, fixed_spin=True)
-    body.add_solid(nodes, tetrahedra, fixed=[], young_modulus=1e5, poisson_ratio=0.4, density=1000.0)
+    body.add_solid(nodes, tetrahedra, fixed=[], young_modulus=1e5, poisson_ratio=0.4, density=1000.0, element="linear")
     model = body.build()
     for k, corner in enumerate([[0, 0, 0.04], [0.02, 0, 0.04], [0, 0.02, 0.04], [0.02, 0.02, 0.04]]):
         here = EmbeddedPoints.in_frame(wall, corner, model.nodes)
@@ -173,7 +173,7 @@ def test_a_body_held_by_bonds_alone(box):
 def test_a_rigid_pendulum_hangs_in_line_with_its_load(box):
     """Only the geometric stiffness of load and bond holds it, not an element."""
     body = ModelBuilder()
-    body.add_solid(*box(), fixed=lambda x: x[:, 0] == 0.0)
+    body.add_solid(*box(), fixed=lambda x: x[:, 0] == 0.0, element="linear")
     base = body.add_frame([0.0, 0.0, 0.5], fixed=True, fixed_spin=True)
     link = body.add_frame([0.1, 0.0, 0.5], fixed_spin=(True, False, True))
     model = body.build()
@@ -212,7 +212,7 @@ def test_redundant_bonds_are_rejected_or_solved(bonded):
 def test_a_part_that_is_not_held_is_an_error(box):
     nodes, tetrahedra = box((0.02, 0.02, 0.04), (2, 2, 3))
     body = ModelBuilder()
-    body.add_solid(nodes, tetrahedra, fixed=nodes[:, 2] == 0.0)
+    body.add_solid(nodes, tetrahedra, fixed=nodes[:, 2] == 0.0, element="linear")
     loose = body.add_frame([0.05, 0.0, 0.0])
     model = body.build()
     model.add("e", Point("loose", EmbeddedPoints.in_frame(loose, np.zeros(3), model.nodes)))

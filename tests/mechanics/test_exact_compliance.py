@@ -107,7 +107,7 @@ def capped(box):
     """A block with a cable, whose upper face is rigid and carries a load beside its middle."""
     nodes, tetrahedra = box((0.02, 0.02, 0.03), (2, 2, 2))
     body = ModelBuilder()
-    body.add_solid(nodes, tetrahedra, fixed=nodes[:, 2] < 1e-9, young_modulus=2e5, poisson_ratio=0.45)
+    body.add_solid(nodes, tetrahedra, fixed=nodes[:, 2] < 1e-9, young_modulus=2e5, poisson_ratio=0.45, element="linear")
     upper = np.flatnonzero(nodes[:, 2] > 0.03 - 1e-9)
     body.carry(body.add_frame([0.01, 0.01, 0.03], np.eye(3)), upper)
     model = body.build()

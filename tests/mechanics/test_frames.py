@@ -124,7 +124,7 @@ def test_each_constraint_contributes_its_curvature_through_frames(capped, full_t
 def test_spins_and_origins_can_be_held_one_by_one(derivatives, rng, box):
     nodes, tetrahedra = box((0.02, 0.02, 0.03), (2, 2, 2), jitter=0.2)
     body = ModelBuilder()
-    body.add_solid(nodes, tetrahedra, fixed=nodes[:, 2] < 1e-9, poisson_ratio=0.4, young_modulus=2e5)
+    body.add_solid(nodes, tetrahedra, fixed=nodes[:, 2] < 1e-9, poisson_ratio=0.4, young_modulus=2e5, element="linear")
     hinge = body.add_frame([0.01, 0.01, 0.03], fixed=(False, True, False), fixed_spin=(True, False, True))
     body.carry(hinge, cap(nodes))
     model = body.build()
@@ -215,7 +215,7 @@ def test_a_clamped_frame_is_a_clamp(box):
     """A face carried by a fixed frame is a fixed face."""
     nodes, tetrahedra = box((0.1, 0.02, 0.02), (4, 1, 1))
     face = nodes[:, 0] == 0.0
-    options = {"young_modulus": 1e6, "poisson_ratio": 0.3}
+    options = {"element": "linear", "young_modulus": 1e6, "poisson_ratio": 0.3}
     tips = []
     for by_frame in (False, True):
         body = ModelBuilder(gravity=(0.0, 0.0, -9.81))

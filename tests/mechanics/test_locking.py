@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import warnings
+from contextvars import ContextVar
 
 import pytest
 from scipy.optimize import brentq
 
+from softgym_envs.mechanics import locking
 from softgym_envs.mechanics.locking import LockingWarning, missing_compliance
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
@@ -17,6 +19,12 @@ from skfem.helpers import ddot, eye, sym_grad, trace  # noqa: E402
 
 SIZE, YOUNG = (0.1, 0.02, 0.02), 3e5
 BAR = box_mesh(SIZE, (10, 2, 2))
+
+
+@pytest.fixture(autouse=True)
+def nothing_accepted(monkeypatch):
+    """The other tests accept coarse elements; see conftest.py."""
+    monkeypatch.setattr(locking, "_accepted", ContextVar("accepted", default=False))
 
 
 def work(basis, poisson):

@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from softgym_envs import make_robot
 from softgym_envs.errors import ConvergenceError, DataError, DesignError, InfeasibleDesign
 from softgym_envs.mechanics.solvers.statics import Statics
+from softgym_envs.robots import stiff_flop
 from softgym_envs.surrogate.data import dataset, sampling
 from softgym_envs.surrogate.data.dataset import COLUMNS, generate_dataset, load_dataset
 from softgym_envs.surrogate.data.sampling import (
@@ -478,6 +479,13 @@ def test_data_of_another_plan_are_refused(copied):
         generate_dataset(copied, "trunk", SamplingPlan(4, 3, "halton", 6), groups_per_shard=2, progress=False)
     with pytest.raises(DataError, match="different: .*robot"):
         generate_dataset(copied, "finger", PLAN, groups_per_shard=2, progress=False)
+
+
+def test_data_of_other_bodies_are_refused(copied, monkeypatch):
+    """An edited robot has the same name and options; what it builds tells."""
+    monkeypatch.setattr(stiff_flop, "AREA_SHARE", 0.9 * stiff_flop.AREA_SHARE)
+    with pytest.raises(DataError, match="holds states of other bodies of robot 'trunk': .* body was .*, now .*code"):
+        generate_dataset(copied, "trunk", PLAN, groups_per_shard=2, progress=False)
 
 
 @pytest.mark.parametrize("sequence", ["halton", "sobol", "random"])

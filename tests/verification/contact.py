@@ -243,7 +243,9 @@ def patch(distances: Sequence[float] = (1e-4,), pressure: float = 1e4) -> list[R
                 fixed = np.isclose(nodes, 0.0, atol=1e-9)
                 fixed[:, 2] &= bottom
                 nodes = nodes + [0.0, 0.0, size[2] + height if between and not bottom else 0.0 if between else height]
-                start = builder.add_solid(nodes, tetrahedra, fixed=fixed, young_modulus=young, poisson_ratio=0.3)
+                start = builder.add_solid(
+                    nodes, tetrahedra, fixed=fixed, young_modulus=young, poisson_ratio=0.3, element="linear"
+                )
             model = builder.build()
             top = model.nodes[start:, 2].max()
             corners = model.solids[-1].corners
@@ -273,7 +275,9 @@ PLANE_BELOW = -0.003
 def _cantilever(cells: tuple[int, int, int]) -> MechanicalModel:
     nodes, tetrahedra = box_mesh(CANTILEVER, cells)
     builder = ModelBuilder()
-    builder.add_solid(nodes, tetrahedra, fixed=nodes[:, 0] == 0.0, young_modulus=1e5, poisson_ratio=0.3)
+    builder.add_solid(
+        nodes, tetrahedra, fixed=nodes[:, 0] == 0.0, young_modulus=1e5, poisson_ratio=0.3, element="linear"
+    )
     model = builder.build()
     model.add_effector("tip", (CANTILEVER[0], 0.5 * CANTILEVER[1], CANTILEVER[2]))
     return model
@@ -381,7 +385,9 @@ def block_on_incline(
     else:
         nodes, tetrahedra = box_mesh(size, cells)
         nodes = nodes + [0.0, 0.0, 0.95 * distance]
-        builder.add_solid(nodes, tetrahedra, fixed=np.zeros(len(nodes), bool), young_modulus=1e6, poisson_ratio=0.3)
+        builder.add_solid(
+            nodes, tetrahedra, fixed=np.zeros(len(nodes), bool), young_modulus=1e6, poisson_ratio=0.3, element="linear"
+        )
         model = builder.build()
         model.add("e", Point("centre", model.embed(centre)))
     plane = Plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), friction=friction)
@@ -474,7 +480,11 @@ def collision(step: float = 2e-4, steps: int = 60) -> list[Row]:
     for shift in ((0.0, 0.0, 0.0), (0.0021, 0.0033, 0.0106)):
         nodes, tetrahedra = box_mesh((0.01, 0.01, 0.01), (2, 2, 2), jitter=0.1)
         fixed = np.zeros(len(nodes), dtype=bool)
-        starts.append(builder.add_solid(nodes + shift, tetrahedra, fixed=fixed, young_modulus=1e5, poisson_ratio=0.3))
+        starts.append(
+            builder.add_solid(
+                nodes + shift, tetrahedra, fixed=fixed, young_modulus=1e5, poisson_ratio=0.3, element="linear"
+            )
+        )
     model = builder.build()
     model.set_contact(settings=ContactSettings(self_contact=True, distance=5e-4))
     solver = Dynamics(model, step=step)
@@ -518,7 +528,9 @@ def creep(increments: int = 20, degrees: float = 15.0, friction: float = 0.5) ->
     ):
         nodes, tetrahedra = box_mesh(size, cells)
         fixed = (nodes[:, 2] < 1e-9) & (shift[2] == 0.0)
-        builder.add_solid(nodes + shift, tetrahedra, fixed=fixed, young_modulus=1e6, poisson_ratio=0.3)
+        builder.add_solid(
+            nodes + shift, tetrahedra, fixed=fixed, young_modulus=1e6, poisson_ratio=0.3, element="linear"
+        )
     model = builder.build()
     model.add("e", Point("top", model.embed(np.array([0.009, 0.01, 0.008]), block=1)))
     model.set_contact(settings=ContactSettings(self_contact=True, self_friction=friction, distance=3e-4, stiffness=1e4))

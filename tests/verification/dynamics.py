@@ -408,9 +408,8 @@ def pulled_bar(**options) -> MechanicalModel:
     nodes, tetrahedra = box_mesh(cells=(2, 2, 8))
     body = ModelBuilder(gravity=GRAVITY)
     nodes = nodes * [0.02, 0.02, 0.2]
-    body.add_solid(
-        nodes, tetrahedra, fixed=nodes[:, 2] > 0.199, young_modulus=5e5, poisson_ratio=0.4, density=1000.0, **options
-    )
+    options = {"element": "linear", "young_modulus": 5e5, "poisson_ratio": 0.4, "density": 1000.0, **options}
+    body.add_solid(nodes, tetrahedra, fixed=nodes[:, 2] > 0.199, **options)
     model = body.build()
     cable = np.array([[0.016, 0.009, z] for z in (0.18, 0.1, 0.02)])
     model.add_cable("cable", cable, np.array([0.016, 0.009, 0.205]))

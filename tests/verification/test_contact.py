@@ -92,6 +92,7 @@ def carried_ball(obstacle, *, friction_above=0.0):
         fixed=nodes[:, 2] == 0.0,
         young_modulus=1e5,
         poisson_ratio=0.4,
+        element="linear",
     )
     assert start == 0
     frame = builder.add_frame((0.001, 0.002, 0.0126), cases.UP, fixed_spin=True)
@@ -222,7 +223,9 @@ def test_compliance_with_an_obstacle_that_moves(shape, friction, tolerance):
 def test_compliance_of_a_bending_finger_with_cables_on_a_cylinder(friction, tolerance):
     nodes, tetrahedra = box_mesh((0.06, 0.01, 0.01), (12, 2, 2))
     builder = ModelBuilder()
-    builder.add_solid(nodes, tetrahedra, fixed=nodes[:, 0] == 0.0, young_modulus=2e5, poisson_ratio=0.4)
+    builder.add_solid(
+        nodes, tetrahedra, fixed=nodes[:, 0] == 0.0, young_modulus=2e5, poisson_ratio=0.4, element="linear"
+    )
     model = builder.build()
     for y in (0.003, 0.007):
         model.add_cable(f"cable {y}", [(0.055, y, 0.001), (0.03, y, 0.001)], (-0.005, y, 0.001))
@@ -264,7 +267,9 @@ def test_compliance_with_self_contact_and_an_obstacle():
     for x in (0.0, 0.0063):
         nodes, tetrahedra = box_mesh((0.006, 0.008, 0.03), (2, 2, 6), jitter=0.1, seed=int(1e4 * x))
         fixed = nodes[:, 2] == 0.0
-        builder.add_solid(nodes + [x, 0, 0], tetrahedra, fixed=fixed, young_modulus=2e5, poisson_ratio=0.4)
+        builder.add_solid(
+            nodes + [x, 0, 0], tetrahedra, fixed=fixed, young_modulus=2e5, poisson_ratio=0.4, element="linear"
+        )
     model = builder.build()
     model.add("e", Point("left", model.embed(np.array([0.003, 0.004, 0.029]), block=0)))
     model.add("e", Point("right", model.embed(np.array([0.009, 0.004, 0.027]), block=1)))
@@ -304,7 +309,9 @@ def test_a_soft_and_a_rigid_block_exchange_momentum():
     """A free rigid box with an obstacle hits a free soft block: the total momentum and the energy."""
     builder = ModelBuilder(floating=True)
     nodes, tetrahedra = box_mesh((0.01, 0.01, 0.01), (3, 3, 3))
-    builder.add_solid(nodes, tetrahedra, fixed=np.zeros(len(nodes), bool), young_modulus=1e5, poisson_ratio=0.3)
+    builder.add_solid(
+        nodes, tetrahedra, fixed=np.zeros(len(nodes), bool), young_modulus=1e5, poisson_ratio=0.3, element="linear"
+    )
     half = np.array([0.006, 0.006, 0.004])
     frame = builder.add_frame((0.0062, 0.0047, 0.01 + half[2] + 6e-4))
     builder.add_mass(frame, 0.002, box_inertia(0.002, half))

@@ -132,6 +132,7 @@ class SensorizedFinger(GmshRobot):
         if cavities not in (2, 4):
             raise ValueError(f"cavities = {cavities!r} is unknown; allowed: 2, 4")
         super().__init__(mesh=mesh, meshing=meshing, **options)
+        self.reproduces_scene = self.tier in (self.meshes["published"], self.meshes["local"])
         self.cavities, self.touch = cavities, touch
         mm = 1e-3
         shape = [

@@ -61,6 +61,8 @@ class AveragedTetrahedra(Tetrahedra):
     Args: as for `Tetrahedra`.
     """
 
+    element = "averaged"
+
     def __init__(self, nodes: np.ndarray, connectivity: np.ndarray, **options: Unpack[SolidOptions]) -> None:
         super().__init__(nodes, connectivity, **options)
         m = len(self.connectivity)

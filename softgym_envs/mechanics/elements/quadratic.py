@@ -135,6 +135,8 @@ class QuadraticTetrahedra(SolidBlock):
         ValueError: for a degenerate or negatively oriented element, an index out of range or an unknown material.
     """
 
+    element = "quadratic"
+
     def __init__(self, nodes: np.ndarray, connectivity: np.ndarray, **options: Unpack[SolidOptions]) -> None:
         connectivity = np.array(connectivity, dtype=np.int64)
         if connectivity.ndim != 2 or connectivity.shape[1] != 10:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import TypedDict, Unpack
+from typing import ClassVar, TypedDict, Unpack
 
 import numpy as np
 
@@ -246,7 +246,12 @@ class SolidBlock(ElementBlock):
         young_modulus: [Pa], scalar or shape (m,).
         poisson_ratio: scalar or shape (m,), inside (-1, 0.5).
         density: [kg/m3].
+
+    Attributes:
+        element: name by which this kind of elements is asked for; empty for kinds that are not.
     """
+
+    element: ClassVar[str] = ""
 
     def __init__(
         self,
@@ -415,6 +420,8 @@ class Tetrahedra(SolidBlock):
     Raises:
         ValueError: for a degenerate element, an index out of range or an unknown material.
     """
+
+    element = "linear"
 
     def __init__(self, nodes: np.ndarray, connectivity: np.ndarray, **options: Unpack[SolidOptions]) -> None:
         connectivity, volumes, _ = orient_corners(nodes, connectivity)

@@ -15,6 +15,7 @@ from softgym_envs.robots.base import Robot
 from softgym_envs.robots.registry import make_robot
 from softgym_envs.storage import atomic_write, read_npz, write_json
 from softgym_envs.surrogate.data.sampling import SamplingPlan, sample_group
+from softgym_envs.surrogate.identity import class_of, difference, fingerprint
 from softgym_envs.version import __version__
 from softgym_envs.wording import counted
 
@@ -115,8 +116,8 @@ def generate_dataset(
         progress: show a progress bar.
 
     Raises:
-        DataError: if the folder holds a dataset of another plan, another process is writing to it, or no design of the
-            plan is feasible.
+        DataError: if the folder holds a dataset of another plan, or of other bodies because code or a file of the robot
+            has changed, another process is writing to it, or no design of the plan is feasible.
         DesignError: if the plan does not fit the robot.
         ValueError: for an unknown executor.
     """
@@ -128,6 +129,8 @@ def generate_dataset(
         "robot": robot,
         "robot_options": options,
         "mechanics_key": body.mechanics_key,
+        "class": class_of(body),
+        "fingerprint": fingerprint(body),
         "plan": asdict(plan),
         "groups_per_shard": groups_per_shard,
         "columns": {
@@ -242,6 +245,13 @@ def _check_manifest(folder: Path, manifest: dict[str, Any]) -> bool:
     kept = _read_manifest(folder / "manifest.json")
     # Options of a plan that are newer than a dataset have their defaults.
     kept["plan"] = json.loads(json.dumps(asdict(SamplingPlan(1, 0)))) | kept["plan"]
+    same = all(kept[name] == manifest[name] for name in ("robot", "class", "mechanics_key"))
+    if same and (other := difference(kept["fingerprint"], manifest["fingerprint"])):
+        raise DataError(
+            f"'{folder}' holds states of other bodies of robot '{manifest['robot']}': {other}; was its code or a file "
+            "changed? Use a new folder"
+        )
+    kept["fingerprint"] = manifest["fingerprint"]  # the same but for round-off
     if kept == manifest:
         return False
     groups, whole = kept["plan"]["groups"], kept["groups_per_shard"]
@@ -260,7 +270,8 @@ def _read_manifest(path: Path) -> dict:
         raise DataError(f"manifest '{path}' cannot be read: {error}") from error
     if not isinstance(manifest, dict) or manifest.get("format") != _FORMAT:
         raise DataError(f"manifest '{path}' does not have format {_FORMAT}")
-    missing = sorted({"plan", "groups_per_shard", "columns"} - manifest.keys())
+    wanted = {"mechanics_key", "class", "fingerprint", "plan", "groups_per_shard", "columns"}
+    missing = sorted(wanted - manifest.keys())
     if missing:
         raise DataError(f"manifest '{path}' lacks {', '.join(missing)}")
     return manifest

@@ -15,7 +15,9 @@ def block_and_box():
     """A free soft block of 20 x 20 x 10 mm with a rigid box above, and the first row of the frame of the box."""
     nodes, tetrahedra = box_mesh((0.02, 0.02, 0.01), (3, 3, 2))
     builder = ModelBuilder(floating=True)
-    builder.add_solid(nodes, tetrahedra, fixed=np.zeros(len(nodes), bool), young_modulus=1e6, poisson_ratio=0.3)
+    builder.add_solid(
+        nodes, tetrahedra, fixed=np.zeros(len(nodes), bool), young_modulus=1e6, poisson_ratio=0.3, element="linear"
+    )
     frame = builder.add_frame([0.01, 0.012, 0.0199])
     builder.add_mass(frame, 0.01, 1e-6 * np.eye(3))
     model = builder.build()

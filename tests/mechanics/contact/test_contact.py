@@ -90,7 +90,7 @@ def test_nothing_passes_through_an_obstacle(rng):
     """The free part of a way ends before the first point enters, however long the way is."""
     nodes, tetrahedra = box_mesh((0.02, 0.02, 0.01), (3, 3, 2))
     builder = ModelBuilder(floating=True)
-    builder.add_solid(nodes, tetrahedra, fixed=np.zeros(len(nodes), bool))
+    builder.add_solid(nodes, tetrahedra, fixed=np.zeros(len(nodes), bool), element="linear")
     model = builder.build()
     thin = RoundedPrism.box((0.05, 0.05, 3e-4), 2e-4, centre=(0.0, 0.0, -0.003))
     model.set_contact(obstacles=[thin, Sphere((0.05, 0.01, 0.005), 0.004)])
@@ -164,7 +164,7 @@ def clamped_block(obstacles, *, distance=5e-4):
     nodes, tetrahedra = box_mesh((0.02, 0.02, 0.03), (3, 3, 4), jitter=0.2)
     builder = ModelBuilder()
     fixed = nodes[:, 2] > 0.0299
-    builder.add_solid(nodes, tetrahedra, fixed=fixed, young_modulus=2e5, poisson_ratio=0.4)
+    builder.add_solid(nodes, tetrahedra, fixed=fixed, young_modulus=2e5, poisson_ratio=0.4, element="linear")
     model = builder.build()
     model.add_effector("middle", (0.01, 0.01, 0.01))
     model.set_contact(obstacles=obstacles, settings=ContactSettings(distance=distance))

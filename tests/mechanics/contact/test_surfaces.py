@@ -68,7 +68,9 @@ def block_on(floor, degrees):
     angle = np.radians(degrees)
     builder = ModelBuilder(gravity=9.81 * np.array([np.sin(angle), 0.0, -np.cos(angle)]))
     nodes, tetrahedra = box_mesh((0.02, 0.02, 0.01), (3, 3, 2))
-    builder.add_solid(nodes, tetrahedra, fixed=nodes[:, 2] > 0.0099, young_modulus=1e4, poisson_ratio=0.3)
+    builder.add_solid(
+        nodes, tetrahedra, fixed=nodes[:, 2] > 0.0099, young_modulus=1e4, poisson_ratio=0.3, element="linear"
+    )
     model = builder.build()
     model.add_effector("middle", (0.01, 0.01, 0.003))
     model.set_contact(obstacles=[floor], settings=ContactSettings(distance=4e-4))
@@ -93,10 +95,14 @@ def two_blocks():
     """A block that is clamped at its bottom, and a smaller one above it, clamped at its top."""
     builder = ModelBuilder()
     lower, tetrahedra = box_mesh((0.02, 0.02, 0.01), (3, 3, 2), jitter=0.1)
-    builder.add_solid(lower, tetrahedra, fixed=lower[:, 2] < 1e-6, young_modulus=1e5, poisson_ratio=0.4)
+    builder.add_solid(
+        lower, tetrahedra, fixed=lower[:, 2] < 1e-6, young_modulus=1e5, poisson_ratio=0.4, element="linear"
+    )
     upper, tetrahedra = box_mesh((0.012, 0.012, 0.012), (2, 2, 3), jitter=0.1)
     upper = upper + [0.0043, 0.0037, 0.0103]
-    builder.add_solid(upper, tetrahedra, fixed=upper[:, 2] > 0.0222, young_modulus=1e5, poisson_ratio=0.4)
+    builder.add_solid(
+        upper, tetrahedra, fixed=upper[:, 2] > 0.0222, young_modulus=1e5, poisson_ratio=0.4, element="linear"
+    )
     model = builder.build()
     model.add_effector("inside", (0.01, 0.01, 0.007))
     model.set_contact(settings=ContactSettings(self_contact=True, distance=4e-4))
@@ -140,7 +146,7 @@ def test_two_bodies_press_on_each_other_with_equal_forces():
 def test_nothing_passes_through_a_thin_mesh(rng):
     nodes, tetrahedra = box_mesh((0.02, 0.02, 0.01), (3, 3, 2))
     builder = ModelBuilder(floating=True)
-    builder.add_solid(nodes, tetrahedra, fixed=np.zeros(len(nodes), bool))
+    builder.add_solid(nodes, tetrahedra, fixed=np.zeros(len(nodes), bool), element="linear")
     model = builder.build()
     thin = mesh_box((0.05, 0.05, 1e-4), (1, 1, 1), (0.0, 0.0, -0.003))
     model.set_contact(obstacles=[thin])
@@ -162,7 +168,9 @@ def box_on_a_block(shape, *, self_contact, obstacles=()):
     """A free rigid box with a skin, which an obstacle stands for, on a soft block."""
     nodes, tetrahedra = box_mesh((0.02, 0.02, 0.01), (4, 4, 2))
     builder = ModelBuilder(floating=True, gravity=(0.0, 0.0, -9.81))
-    builder.add_solid(nodes, tetrahedra, fixed=nodes[:, 2] == 0.0, young_modulus=1e5, poisson_ratio=0.4)
+    builder.add_solid(
+        nodes, tetrahedra, fixed=nodes[:, 2] == 0.0, young_modulus=1e5, poisson_ratio=0.4, element="linear"
+    )
     half = (0.006, 0.005, 0.004)
     frame = builder.add_frame((0.01, 0.01, 0.01 + half[2] + 3e-4))
     builder.add_mass(frame, 0.02, box_inertia(0.02, np.array(half)))
