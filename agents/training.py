@@ -376,7 +376,7 @@ def _meta(path: Path) -> dict[str, Any]:
     try:
         with safe_open(path, framework="numpy") as opened:
             return json.loads(opened.metadata()["training"])
-    except SafetensorError as error:
+    except (SafetensorError, OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise WeightsError(f"checkpoint '{path}' is damaged or truncated: {error}") from None
 
 

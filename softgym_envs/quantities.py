@@ -168,10 +168,7 @@ def check_quantity(
     """
     quantity = QUANTITIES[name]
     unit = "" if quantity.unit == "1" else f" {quantity.unit}"
-    try:
-        values = np.ravel(np.asarray(value, dtype=float))
-    except (TypeError, ValueError):
-        raise ValueError(f"{label} = {value!r} must be a number{unit and f' [{quantity.unit}]'}") from None
+    values = numbers(value, label, quantity.unit)
     if not np.isfinite(values).all():
         raise ValueError(f"{label} = {_shown(value)}{unit} must be finite")
     if not quantity.signed and (values < 0.0).any():
@@ -193,6 +190,33 @@ def check_quantity(
         f"({example if high is not None and limit == high else quantity.example});{meant} "
         f"{f'({hint}) ' if hint else ''}if it is meant, set {UNCHECKED}={name}"
     )
+
+
+def numbers(value: object, label: str, unit: str = "1") -> np.ndarray:
+    """Return one number or several as a flat array of floats.
+
+    Raises:
+        ValueError: for anything else, such as texts, with the unit that is expected.
+    """
+    try:
+        array = np.ravel(np.asarray(value))
+    except ValueError:  # rows of different lengths
+        array = np.array(["?"])
+    if array.dtype.kind not in "biuf":
+        raise ValueError(f"{label} = {value!r} must be a number{'' if unit == '1' else f' [{unit}]'}")
+    return array.astype(float)
+
+
+def number(value: object, label: str, unit: str = "1") -> float:
+    """Return a finite number.
+
+    Raises:
+        ValueError: for anything else, with the unit that is expected.
+    """
+    array = numbers(value, label, unit)
+    if np.ndim(value) or not np.isfinite(array).all():  # type: ignore[arg-type]
+        raise ValueError(f"{label} = {value!r} must be one finite number{'' if unit == '1' else f' [{unit}]'}")
+    return float(array[0])
 
 
 def check_unit(unit: object, label: str) -> None:

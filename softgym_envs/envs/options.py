@@ -283,8 +283,10 @@ def check_reset_options(options: Mapping[str, Any] | None) -> tuple[Any, Any]:
     """Return ``design`` and ``goal`` from the options of `reset`; None where missing.
 
     Raises:
-        ValueError: for an unknown option.
+        ValueError: for an unknown option, or anything but a mapping.
     """
+    if options is not None and not isinstance(options, Mapping):
+        raise ValueError(f"options of reset = {options!r} must be a mapping of 'design' and 'goal', or None")
     options = options or {}
     for name in options:
         if name not in ("design", "goal"):

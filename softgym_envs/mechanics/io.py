@@ -206,6 +206,8 @@ def _points(path: Path, mesh: Any, factor: float) -> np.ndarray:
     points = np.asarray(mesh.points, dtype=float)
     if points.ndim != 2 or points.shape[1] < 3:
         raise DataError(f"mesh file '{path}' has no points in space: their shape is {points.shape}")
+    if len(bad := np.flatnonzero(~np.isfinite(points).all(axis=1))):
+        raise DataError(f"mesh file '{path}': point {bad[0]} is not finite: {points[bad[0]].tolist()}")
     return points[:, :3] * factor
 
 

@@ -49,7 +49,7 @@ from softgym_envs.mechanics.solids import (
 )
 from softgym_envs.mechanics.surfaces import cavity_around, cavity_like
 from softgym_envs.mechanics.warping import Warping
-from softgym_envs.quantities import check_quantity
+from softgym_envs.quantities import check_quantity, number, numbers
 
 announce_compilation()
 
@@ -268,10 +268,10 @@ class MechanicalModel:
             ValueError: if a point is farther from the body than the body's size, or the body does not reach into its
                 radius.
         """
-        solid = self._solid(block)
-        places = np.asarray(points, dtype=float)
-        check_distance(places, self._solid_nodes, name, 1.0)
-        return solid.embed_average(places, self.nodes, radius) if radius else solid.embed(places, self.nodes, hint)
+        solid, radius = self._solid(block), number(radius, f"radius of {name}", "m")
+        check_distance(points, self._solid_nodes, name, 1.0)
+        at = np.asarray(points, dtype=float)
+        return solid.embed_average(at, self.nodes, radius) if radius else solid.embed(at, self.nodes, hint)
 
     def _solid(self, block: int) -> SolidBlock:
         solids = self.solids
@@ -318,7 +318,7 @@ class MechanicalModel:
             ValueError: if a guide without a hint lies an element's length outside the body, or the pull point ten times
                 its size, or not at three finite numbers.
         """
-        origin = np.asarray(pull_point, dtype=float)
+        origin = numbers(pull_point, f"the pull point of cable '{name}'", "m")
         if origin.shape != (3,) or not np.isfinite(origin).all():
             raise ValueError(f"the pull point of cable '{name}' must be three finite numbers, got {origin.tolist()}")
         check_distance(origin, self._solid_nodes, f"the pull point of cable '{name}'", 10.0)
@@ -362,13 +362,14 @@ class MechanicalModel:
             raise ValueError(f"cavity '{name}' needs either its 'surface' or a point 'inside' it")
         solid = self._solid(block)
         if surface is None:
-            check_distance(np.asarray(inside), self._solid_nodes, f"the point inside cavity '{name}'", 1.0)
+            check_distance(inside, self._solid_nodes, f"the point inside cavity '{name}'", 1.0)
             triangles = cavity_around(self.nodes, solid.corners, np.asarray(inside), name)
         elif isinstance(surface, str | Path):
             points, faces, in_metres = read_surface(surface)
             factors = [1.0] if in_metres else [unit_factor(None, unit)] if unit else list(UNITS.values())
             triangles = cavity_like(self.nodes, solid.corners, [(f * points, faces) for f in factors], name)
         else:
+            numbers(surface, f"surface of cavity '{name}'")
             triangles = np.asarray(surface)
         cavity = self.cavity(name, triangles, block=block)
         self.add("a", cavity)
@@ -423,8 +424,7 @@ class MechanicalModel:
         """
         if not isinstance(point, EmbeddedPoints):
             point = self.embed(point, hint, block=block, name=f"effector '{name}'", radius=radius)
-        effector = Point(name, point)
-        self.add("e", effector)
+        self.add("e", effector := Point(name, point))
         return effector
 
     def add_contact(

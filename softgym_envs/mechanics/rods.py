@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from softgym_envs.mechanics.constraints.cable import Cable
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.elements.beams import Beam, Section, lagrange
+from softgym_envs.quantities import numbers
 
 ENDS = {"none": (), "start": (0,), "both": (0, -1)}
 """Which frames of a rod are clamped, by name."""
@@ -107,8 +108,12 @@ def straight_places(length: float, elements: int | Sequence[float] | np.ndarray,
     Raises:
         ValueError: if the ends do not rise from zero to the length.
     """
-    ends = np.linspace(0.0, length, elements + 1) if isinstance(elements, int) else np.asarray(elements, dtype=float)
-    if len(ends) < 2 or not (np.diff(ends) > 0.0).all() or not np.allclose(ends[[0, -1]], [0.0, length], atol=1e-9):
+    numbers(elements, "elements")
+    if isinstance(elements, int | np.integer) and not isinstance(elements, bool):
+        elements = np.linspace(0.0, length, max(int(elements), 0) + 1)
+    ends = np.atleast_1d(np.asarray(elements, dtype=float))
+    rise = ends.ndim == 1 and len(ends) > 1 and bool((np.diff(ends) > 0.0).all())
+    if not rise or not np.allclose(ends[[0, -1]], [0.0, length], atol=1e-9):
         raise ValueError(f"ends of elements must rise from 0 to {length:g} m, got {ends.tolist()}")
     if order == 1:
         return ends

@@ -15,7 +15,7 @@ from softgym_envs.mechanics.elements.averaged import AveragedTetrahedra
 from softgym_envs.mechanics.elements.quadratic import EDGES, QuadraticTetrahedra, add_midside_nodes
 from softgym_envs.mechanics.elements.tetrahedra import SolidBlock, Tetrahedra, check_nodes
 from softgym_envs.mechanics.mesh_checks import check_mesh
-from softgym_envs.quantities import check_quantity
+from softgym_envs.quantities import check_quantity, number, numbers
 
 SOLIDS: dict[str, type[SolidBlock]] = {
     kind.element: kind for kind in (Tetrahedra, AveragedTetrahedra, QuadraticTetrahedra)
@@ -83,7 +83,7 @@ def solid_part(
     for name, value in (("young_modulus", young_modulus), ("poisson_ratio", poisson_ratio)):
         options[name] = _element_values(name, value, nodes, tetrahedra, regions or {})
     if total_mass is not None:
-        if not (np.isfinite(total_mass) and total_mass > 0.0):
+        if not number(total_mass, "total_mass", "kg") > 0.0:
             raise ValueError(f"total_mass = {total_mass} kg must be positive and finite")
         density = total_mass / kind(nodes, tetrahedra).volume  # type: ignore[call-arg]
         check_quantity(
@@ -153,7 +153,7 @@ def check_modulus(young_modulus: ArrayLike) -> None:
     check_quantity("modulus", values[values > 0.0], "young_modulus")
 
 
-def check_distance(points: np.ndarray, nodes: np.ndarray, name: str, sizes: float) -> None:
+def check_distance(points: Any, nodes: np.ndarray, name: str, sizes: float) -> None:
     """Reject points that lie more than ``sizes`` body sizes outside the bounding box of a body.
 
     Args:
@@ -165,8 +165,9 @@ def check_distance(points: np.ndarray, nodes: np.ndarray, name: str, sizes: floa
     Raises:
         ValueError: with the point that lies farthest outside.
     """
+    numbers(points, name, "m")
     points = np.atleast_2d(np.asarray(points, dtype=float))
-    if points.shape[1] != 3:
+    if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"{name} must have coordinates of shape (p, 3), got {points.shape}")
     low, high = nodes.min(axis=0), nodes.max(axis=0)
     size = float(np.linalg.norm(high - low))
@@ -228,6 +229,7 @@ def _element_values(
         return out
     if callable(values):
         values = np.asarray(values(nodes[tetrahedra[:, :4]].mean(axis=1)), dtype=float)
+    numbers(values, name)
     array = np.asarray(values, dtype=float)
     if array.ndim and array.shape != (count,):
         raise ValueError(f"{name} must be one number, or one for each of the {count} elements, got shape {array.shape}")

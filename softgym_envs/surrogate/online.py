@@ -38,7 +38,7 @@ import numpy as np
 from softgym_envs.errors import DataError, WeightsError
 from softgym_envs.extras import require
 from softgym_envs.robots.base import Robot
-from softgym_envs.storage import atomic_write, read_npz, write_json
+from softgym_envs.storage import atomic_write, read_json, read_npz, write_json
 from softgym_envs.surrogate.data.dataset import COLUMNS
 from softgym_envs.surrogate.data.states import GROWTH, States, stable_rows, training_states
 from softgym_envs.surrogate.model import SurrogateModel
@@ -113,10 +113,7 @@ class StateStore:
         manifest = {"format": _FORMAT, "robot": robot.name, "mechanics_key": robot.mechanics_key}
         path = self.folder / "manifest.json"
         if path.exists():
-            try:
-                found = json.loads(path.read_text())
-            except (OSError, ValueError) as error:
-                raise DataError(f"manifest '{path}' cannot be read: {error}") from error
+            found = read_json(path)
             if found != manifest:
                 raise DataError(f"'{self.folder}' holds states of another robot: {found}, needed {manifest}")
         else:

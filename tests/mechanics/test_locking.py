@@ -5,10 +5,13 @@ from __future__ import annotations
 import warnings
 from contextvars import ContextVar
 
+import numpy as np
 import pytest
 from scipy.optimize import brentq
 
+from softgym_envs import make_robot
 from softgym_envs.mechanics import locking
+from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.locking import LockingWarning, missing_compliance
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
@@ -108,3 +111,44 @@ def test_the_default_does_not_warn():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         model(0.49)
+
+
+def caught_by(make):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        make()
+    return [str(warning.message) for warning in caught if warning.category is LockingWarning]
+
+
+@pytest.mark.parametrize("density", [1100.0, 0.0])
+@pytest.mark.parametrize("held", ["clamped", "carried", "floating"])
+def test_a_builder_warns_too(held, density):
+    """However a solid is held, and whether it has a mass."""
+
+    def make():
+        builder = ModelBuilder(floating=held == "floating")
+        clamped = BAR[0][:, 0] == 0.0
+        fixed = clamped & (held == "clamped")
+        builder.add_solid(*BAR, fixed=fixed, element="linear", poisson_ratio=0.45, density=density)
+        if held == "carried":
+            builder.carry(builder.add_frame([0.0, 0.0, 0.0], fixed=True, fixed_spin=True), np.flatnonzero(clamped))
+        builder.build()
+
+    (message,) = caught_by(make)
+    assert message.startswith("linear elements lock on this mesh: under a uniform load the body gives way by ")
+
+
+def test_large_bodies_warn_without_the_figure(monkeypatch):
+    monkeypatch.setattr(locking, "MOST_NODES", 100)
+    assert caught_by(lambda: model(0.49, "linear")) == [
+        "linear elements lock near a Poisson's ratio of 0.5, here 0.49, and in thin walls"
+    ]
+    assert not caught_by(lambda: model(0.3, "linear"))
+
+
+def test_robots_warn_once_unless_they_reproduce_a_scene():
+    assert not caught_by(make_robot("finger").build)
+    robot = make_robot("finger", mesh_size=15e-3)
+    assert len(caught_by(robot.build)) == 1
+    assert not caught_by(lambda: robot.build({"young_modulus": 4e6}))
+    assert len(caught_by(make_robot("two_finger_friction_gripper").build)) == 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from softgym_envs.errors import InfeasibleDesign
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.bond import Bond
 from softgym_envs.mechanics.elements.quadratic import add_midside_nodes
@@ -116,6 +117,28 @@ def test_a_cut_that_is_meant():
     fixed = (nodes[:, 0] < 1e-9) | (nodes[:, 0] > 0.2 - 1e-9)
     model = MechanicalModel.from_mesh(nodes, tetrahedra, fixed=fixed, check=False)
     assert model.volume == pytest.approx(8e-5)
+
+
+@pytest.mark.parametrize(
+    ("shift", "overlaps"),
+    [((0.09, 0.0, 0.0), True), ((0.0, 0.0, 0.019), True), ((0.03, 0.0113, 0.0), True), ((0.1, 0.0, 0.0), False)],
+)
+def test_solids_of_a_builder_do_not_overlap(shift, overlaps):
+    builder = ModelBuilder()
+    for mesh in (BAR, moved(BAR, shift)):
+        builder.add_solid(*mesh, fixed=mesh[0][:, 0] == mesh[0][:, 0].min(), element="linear")
+    if overlaps:
+        with pytest.raises(InfeasibleDesign, match=r"solids 0 and 1 of the model overlap near \[.* m.*check=False"):
+            builder.build()
+    else:
+        builder.build()
+
+
+def test_an_overlap_that_is_meant():
+    builder = ModelBuilder()
+    builder.add_solid(*BAR, fixed=BAR[0][:, 0] == 0.0, element="linear")
+    builder.add_solid(*BAR, fixed=BAR[0][:, 0] == 0.0, element="linear", check=False)
+    assert builder.build().volume == pytest.approx(8e-5)
 
 
 def test_merging_nodes_keeps_order_and_second_order():

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from softgym_envs.errors import ConvergenceError, ImpossibleState
+from softgym_envs.mechanics.builder import ModelBuilder
+from softgym_envs.mechanics.constraints.cavity import Cavity
 from softgym_envs.mechanics.contact.contact import ContactSettings
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.dynamics import Dynamics
@@ -65,6 +67,46 @@ def test_walls_that_touch_are_left_to_contact():
     found = Statics(model).solve([-400.0], "effort")
     assert self_intersection(found.x, cavity.flat_triangles) is None
     assert found.contacts.self_force > 0.0
+
+
+@pytest.mark.parametrize(
+    ("role", "moved", "walls"),
+    [
+        ("a", 7.0e-3, "walls of 'chamber' and the outside of the body"),
+        ("a", 3.1e-3, "outer walls of the body"),
+        ("s", 7.0e-3, "walls of 'chamber' and the outside of the body"),
+        ("s", 3.1e-3, None),
+    ],
+)
+def test_a_chamber_crosses_nothing_else(role, moved, walls):
+    """A block comes down on the pad, from 3 mm above it: onto it, and then into the chamber."""
+    builder, chambers = ModelBuilder(), pad()
+    block, cells = box_mesh((0.021, 0.022, 0.02), (2, 2, 2), jitter=0.1)
+    for nodes, tetrahedra, fixed in (
+        (chambers.nodes, chambers.solids[0].connectivity, chambers.fixed),
+        (block + [0.0193, 0.0187, 8.5e-3], cells, block[:, 2] > 0.0199),
+    ):
+        builder.add_solid(nodes, tetrahedra, fixed=fixed, young_modulus=2e5, element="averaged")
+    model = builder.build()
+    model.add(role, model.cavity("chamber", chambers.add_cavity("c", inside=INSIDE).triangles))
+    x = model.nodes.copy()
+    x[len(chambers.nodes) :, 2] -= moved
+    found = ShapeCheck.of(model).problem(x)
+    assert ShapeCheck.of(model).problem(model.nodes) is None
+    assert (found is None) == (walls is None)
+    if walls:
+        assert str(found).startswith(f"{walls} pass through each other near [")
+
+
+def test_two_chambers_that_cross():
+    first, second = pad(), pad()
+    nodes = np.vstack([first.nodes, second.nodes + [0.0, 0.0, 0.01]])
+    triangles = first.add_cavity("c", inside=INSIDE).triangles
+    cavities = [Cavity(name, triangles + k * len(first.nodes), nodes) for k, name in enumerate(("low", "high"))]
+    check = ShapeCheck(cavities, np.empty((0, 3), dtype=np.int64), [])
+    assert check.problem(nodes) is None
+    nodes[len(first.nodes) :] -= [0.002, 0.003, 0.0093]
+    assert str(check.problem(nodes)).startswith("walls of 'low' and those of 'high' pass through each other near")
 
 
 @pytest.mark.parametrize("role", ["s", "sealed"])

@@ -109,7 +109,7 @@ def read_measurements(path: str | Path, robot: Robot) -> Measurements:
         raise DataError(f"measurements '{path}' must end with {' or '.join(readers)}")
     try:
         table = readers[path.suffix](path)
-    except (OSError, UnicodeDecodeError, csv.Error, ValueError) as error:
+    except (OSError, UnicodeDecodeError, csv.Error, ValueError, RecursionError) as error:
         raise DataError(f"measurements '{path}' cannot be read: {getattr(error, 'strerror', None) or error}") from None
     return _checked(path, table, robot)
 

@@ -185,7 +185,7 @@ def load_module(path: str | Path) -> LearnedModule:
         return found
     except FileNotFoundError:
         raise WeightsError(f"superelement '{path}' does not exist; learn it with `learn_module`") from None
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, OSError, RecursionError) as error:
         raise WeightsError(f"superelement '{path}' is damaged: {error}") from None
 
 

@@ -23,6 +23,7 @@ from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.elements.beam_kernels import interpolate, pull_back, strains
 from softgym_envs.mechanics.elements.block import ElementBlock, StrainRates, lower_pairs
 from softgym_envs.mechanics.elements.tetrahedra import check_density, element_masses
+from softgym_envs.quantities import number, numbers
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,7 @@ class Section:
 
     def __post_init__(self) -> None:
         values = (self.area, *self.inertia, self.torsion, *self.shear, self.material_area)
-        if not all(np.isfinite(v) and v > 0.0 for v in values):
+        if not (numbers(values, "section values") > 0.0).all() or not np.isfinite(values).all():
             raise ValueError(f"section values must be positive and finite, got {self}")
 
     @property
@@ -58,6 +59,7 @@ class Section:
     @classmethod
     def rectangle(cls, width: float, thickness: float) -> Section:
         """A rectangle with a width [m] along d_2 and a thickness [m] along d_3 (Timoshenko's torsion series)."""
+        width, thickness = number(width, "width", "m"), number(thickness, "thickness", "m")
         if not (width > 0.0 and thickness > 0.0):
             raise ValueError(f"a section of {width} m by {thickness} m must have positive sides")
         area = width * thickness
@@ -73,6 +75,7 @@ class Section:
     @classmethod
     def circle(cls, radius: float, inner: float = 0.0) -> Section:
         """A circle or, with an ``inner`` radius, a tube [m]."""
+        radius, inner = number(radius, "radius", "m"), number(inner, "inner radius", "m")
         if not 0.0 <= inner < radius:
             raise ValueError(f"radii of a section must be 0 <= inner < radius, got {inner} and {radius} m")
         area = np.pi * (radius**2 - inner**2)
@@ -330,6 +333,9 @@ class Beam(ElementBlock):
             raise ValueError("two frames of a beam coincide")
         self.slope = local / speed[:, :, None]
         self.weights = gauss * speed
+        for name, value in (("young_modulus", young_modulus), ("poisson_ratio", poisson_ratio)):
+            if numbers(value, name).size not in (1, m):
+                raise ValueError(f"{name} must be one number, or one for each of the {m} elements, got {value!r}")
         young = np.broadcast_to(np.asarray(young_modulus, dtype=float), (m,))
         poisson = np.broadcast_to(np.asarray(poisson_ratio, dtype=float), (m,))
         if not (np.isfinite(young).all() and (young > 0.0).all()):
@@ -343,6 +349,12 @@ class Beam(ElementBlock):
         )
         self.density = check_density(density)
         areas = np.array([s.material_area for s in sections])
+        length = float(self.weights.sum())
+        if np.sqrt(areas.max()) > length:
+            raise ValueError(
+                f"a beam {length:g} m long has a section of {areas.max():g} m2, which is wider than it is long; "
+                "did you mean metres?"
+            )
         self.lengths = self.weights.sum(axis=1)
         self.nodes_used = np.unique(chain[:, None] + np.arange(4))
         self.volume = float(areas @ self.lengths)

@@ -13,7 +13,7 @@ from softgym_envs.errors import DataError
 from softgym_envs.executors import parallel_map
 from softgym_envs.robots.base import Robot
 from softgym_envs.robots.registry import make_robot
-from softgym_envs.storage import atomic_write, read_npz, write_json
+from softgym_envs.storage import atomic_write, read_json, read_npz, write_json
 from softgym_envs.surrogate.data.sampling import SamplingPlan, sample_group
 from softgym_envs.surrogate.identity import class_of, difference, fingerprint
 from softgym_envs.version import __version__
@@ -264,10 +264,7 @@ def _check_manifest(folder: Path, manifest: dict[str, Any]) -> bool:
 
 
 def _read_manifest(path: Path) -> dict:
-    try:
-        manifest = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise DataError(f"manifest '{path}' cannot be read: {error}") from error
+    manifest = read_json(path)
     if not isinstance(manifest, dict) or manifest.get("format") != _FORMAT:
         raise DataError(f"manifest '{path}' does not have format {_FORMAT}")
     wanted = {"mechanics_key", "class", "fingerprint", "plan", "groups_per_shard", "columns"}

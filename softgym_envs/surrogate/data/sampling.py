@@ -19,6 +19,7 @@ from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError, DesignError, InfeasibleDesign, unknown_name
 from softgym_envs.mechanics.solvers.equilibrium import Equilibrium
 from softgym_envs.mechanics.solvers.statics import Statics
+from softgym_envs.quantities import numbers
 from softgym_envs.robots.base import Robot
 from softgym_envs.robots.gmsh_robot import GmshRobot
 from softgym_envs.surrogate.features import learned_variables
@@ -78,6 +79,9 @@ class SamplingPlan:
                 raise ValueError(f"{name} = {value!r} must be an integer of at least {least}")
         if self.vary is not None and len(set(self.vary)) < len(self.vary):
             raise ValueError(f"vary = {list(self.vary)} names a variable twice")
+        for name, pair in self.bounds.items():
+            if numbers(pair, f"bounds of '{name}'").size != 2:
+                raise ValueError(f"bounds of '{name}' = {pair!r} must be two numbers, the lower and the upper one")
         for name in ("margin", "boundary", "share"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} = {getattr(self, name)} is out of bounds; allowed: [0, 1]")
