@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import runpy
 import sys
+import tomllib
 
 import pytest
 import yaml
@@ -88,3 +89,14 @@ def test_the_demonstration_is_the_shipped_study(softgym, monkeypatch, tmp_path):
     assert (status, out) == (0, f"report: {tmp_path / 'report.html'}\n")
     (((config, folder), options),) = runs
     assert (config.name, folder, options["workers"]) == ("finger_reach", tmp_path, 1)
+
+
+def test_the_conda_recipe_asks_for_what_the_wheel_asks_for():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    recipe = yaml.safe_load((ROOT / ".github" / "conda-recipe.yaml").read_text())
+    python, *others = recipe["requirements"]["run"]
+    assert python == f"python {project['requires-python']}"
+    assert [line.replace(" ", "") for line in others] == project["dependencies"]
+    assert recipe["context"]["version"] == __version__
+    assert recipe["build"]["python"]["entry_points"] == [f"softgym = {project['scripts']['softgym']}"]
+    assert recipe["about"]["summary"] == project["description"]
