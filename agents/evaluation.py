@@ -35,7 +35,8 @@ class Evaluation:
         returns: sum of rewards, shape (n,). Like the means over the steps, NaN if only the ends are known.
         successes: whether each episode ended within the task's success distance, shape (n,); in an average of several
             evaluations, the share that did.
-        efforts: mean actuator effort over the episode [N, ...], shape (n,).
+        efforts: mean actuator effort over the episode [N, ...], shape (n,); for actuators of several units, in shares
+            of `Robot.effort_scale`.
         ends: first effector at the end of each episode [m], shape (n, 3); in an average of several evaluations, the
             mean of their ends.
         steps: environment steps.
@@ -361,7 +362,7 @@ def _run_episode(env: gymnasium.Env, act: Agent, seed: int, options: dict[str, A
     while not ended:
         observation, reward, terminated, truncated, info = env.step(act(observation, env.unwrapped))
         total += float(reward)
-        efforts = np.abs(info["effort"])
+        efforts = env.unwrapped.robot.effort_sizes(info["effort"])  # type: ignore[attr-defined]
         effort, largest = effort + float(efforts.mean()), max(largest, float(efforts.max()))
         distance += info["distance"]
         untrusted += not info["trusted"]
@@ -402,7 +403,7 @@ def _evaluate_together(
             successes[running] = (last["is_success"] & last["converged"])[running]
             totals += running * last["distance"]
             returns += running * reward
-            effort = np.abs(last["effort"])
+            effort = env.unwrapped.robot.effort_sizes(last["effort"])
             efforts += running * effort.mean(axis=1)
             largest = np.maximum(largest, running * effort.max(axis=1))
             untrusted += running & ~last["trusted"]

@@ -44,6 +44,12 @@ def mean_effort(outcome: Outcome) -> np.ndarray:
     return outcome.evaluation.efforts
 
 
+@metric("effort", label="Largest actuator effort", over_path=True)
+def largest_effort(outcome: Outcome) -> np.ndarray | None:
+    """Return the largest effort of any actuator in any step of each episode."""
+    return outcome.evaluation.largest_efforts
+
+
 @metric(shown=PERCENT, label="Share of untrusted states", over_path=True)
 def untrusted_share(outcome: Outcome) -> np.ndarray | None:
     """Return the share of the steps of each episode in which the surrogate does not trust itself."""

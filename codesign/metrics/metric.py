@@ -201,9 +201,12 @@ class _Metrics(Table):
         return found
 
 
+TYPICAL = Display("% of the typical effort", 100.0, 0)
+"""How efforts of several units are shown: as shares of `Robot.effort_scale`."""
+
 _NAMES = (
-    *("success_rate", "mean_distance", "mean_return", "mean_tracking_distance", "mean_effort", "untrusted_share"),
-    "material_volume",
+    *("success_rate", "mean_distance", "mean_return", "mean_tracking_distance", "mean_effort"),
+    *("largest_effort", "untrusted_share", "material_volume"),
 )
 METRICS: Mapping[str, Metric] = _Metrics(
     "metric",
@@ -239,9 +242,7 @@ def find_metric(name: str | Metric, robot: Robot | None = None, task: type[Task]
         raise ValueError(unknown_name("metric", name, METRICS, other="one of your own as 'module:attribute'"))
     if found.unit == "effort" and robot is not None:
         units = {effort_unit(actuator.unit) for actuator in robot.actuators}
-        found = (
-            replace(found, unit=units.pop()) if len(units) == 1 else replace(found, shown=Display("SI units", 1.0, 2))
-        )
+        found = replace(found, unit=units.pop()) if len(units) == 1 else replace(found, unit="1", shown=TYPICAL)
     if found.unit == "distance" and task is not None:
         scale = task.distance_scale
         label = found.label.replace("distance", scale.name)

@@ -146,7 +146,7 @@ class _PendingGoals:
 
 @dataclass(frozen=True)
 class _End:
-    """Where one episode ends; see `FinalStates` for units."""
+    """Where one episode ends; see `FinalStates` for units. Efforts are those of `Robot.effort_sizes`."""
 
     distance: float
     success: bool
@@ -158,12 +158,12 @@ class _End:
     @property
     def effort(self) -> float:
         """Mean effort of the actuators."""
-        return float(np.abs(self.efforts).mean())
+        return float(self.efforts.mean())
 
     @property
     def largest(self) -> float:
         """Largest effort of an actuator."""
-        return float(np.abs(self.efforts).max())
+        return float(self.efforts.max())
 
 
 _COLUMNS = ("distance", "success", "effort", "largest", "effector")
@@ -184,7 +184,8 @@ def _settle(asked: _PendingGoals) -> tuple[dict[int, _End], int]:
                 found = settle(statics, robot, point, command)
         except ConvergenceError as error:
             raise asked.lost(k, error) from None
-        ends[k] = _End(found.distance, found.distance < success, found.effort, found.effector, found.equilibria)
+        sizes = robot.effort_sizes(found.effort)
+        ends[k] = _End(found.distance, found.distance < success, sizes, found.effector, found.equilibria)
     return ends, statics.model.equations
 
 
@@ -215,7 +216,8 @@ def _follow(asked: _PendingGoals, agent: str | Path, last_steps: int) -> tuple[d
             last = inner.backend.snapshot()
             motion = float(np.linalg.norm(info["effector"] - before))
             distance, success = float(info["distance"]), bool(info["is_success"])
-            ends[k] = _End(distance, success, info["effort"], info["effector"], 1 + last_steps, motion)
+            sizes = inner.robot.effort_sizes(info["effort"])
+            ends[k] = _End(distance, success, sizes, info["effector"], 1 + last_steps, motion)
         return ends, inner.backend.model.equations
     finally:
         env.close()

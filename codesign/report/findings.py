@@ -16,6 +16,15 @@ from softgym_envs.wording import counted
 NEGLIGIBLE = 0.1
 """A difference of mean distances below this share of the success distance does not matter."""
 
+SUBSTANTIAL = 0.25
+"""Part of the distance that is left which another controller must close for the policy to be what limits."""
+
+TRUSTED = 0.9
+"""Share of trusted states below which a search on the surrogate is doubtful."""
+
+COSTLIER = 1.1
+"""Ratio of the winner's effort to the baseline's from which it is part of the result."""
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -40,6 +49,10 @@ def findings(snapshot: StudySnapshot, results: StudyResults) -> list[Finding]:
     found = [
         _code(results),
         _goals(snapshot, results),
+        _trust(snapshot, results),
+        _physics(snapshot, results),
+        _ranking(snapshot, results),
+        _effort(snapshot, results),
         _mesh(snapshot, results),
         _failures(snapshot),
         _limit(snapshot, results),
@@ -82,6 +95,84 @@ def _goals(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:
     title = f"{missed} of {counted(row.goals, 'test goal')} {'is' if missed == 1 else 'are'} not reached"
     text = f"The largest {scale.name} is {scale.text(row.winner.worst_distance, 2)}; a goal is reached within {limit}."
     return Finding(title, f"{text} The baseline reaches {lost} of them." if lost else text)
+
+
+def _trust(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:
+    """Return how much of what the bodies did on the surrogate is to be trusted, if that is little."""
+    shares = {}
+    for role, body in (("baseline", results.baseline), ("winner", results.winner)):
+        tests = [g for g in snapshot.unseen_tests if body and g.trial == body.trial and g.backend == "surrogate"]
+        known = [test.table("untrusted") for test in tests]
+        known = [table for table in known if np.isfinite(table).all()]
+        if body is not None and known:
+            shares[role] = 1.0 - float(np.concatenate(known, axis=None).mean())
+    if not shares or min(shares.values()) >= TRUSTED:
+        return None
+    texts = " and ".join(f"{share:.0%} of the states of the {role}" for role, share in shares.items())
+    return Finding(
+        "The surrogate is little trusted",
+        f"It trusts {texts}. A search on it may have found its errors: believe the rows on FEM, fit it with more "
+        "bodies (softgym fit says where it can be trusted), or run the study on FEM or hybrid.",
+    )
+
+
+def _physics(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:
+    """Return whether the winner's distance on the surrogate is another one than on FEM."""
+    assert results.winner is not None
+    rows = {(row.backend, row.agent): row for row in results.comparison}
+    measure = snapshot.config.distance
+    for agent in results.winner.agents:
+        pair = [rows.get((backend, agent)) for backend in ("surrogate", "fem")]
+        if pair[0] is None or pair[1] is None:
+            continue
+        for role in ("winner", "baseline"):
+            learned, real = (getattr(row, role).mean_distance for row in pair)
+            if abs(real - learned) > max(results.success_distance, SUBSTANTIAL * max(real, learned)):
+                return Finding(
+                    "Surrogate and FEM disagree",
+                    f"The {measure.label.lower()} of the {role} is {measure.text(learned)} on the surrogate, where "
+                    f"the search ran, and {measure.text(real)} on FEM. Only FEM counts; fit it with more bodies.",
+                )
+    return None
+
+
+def _ranking(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:
+    """Return whether the inverse QP on FEM, which needs no training, prefers the baseline."""
+    if results.winner is None or results.winner.role == "baseline":
+        return None
+    row = next((row for row in results.comparison if (row.backend, row.agent) == ("fem", "qp")), None)
+    if row is None or not row.distance_change > NEGLIGIBLE * results.success_distance:
+        return None
+    measure = snapshot.config.distance
+    return Finding(
+        "With the inverse QP, the baseline is the better body",
+        f"On FEM it ends at {measure.text(row.baseline.mean_distance)} with the baseline and at "
+        f"{measure.text(row.winner.mean_distance)} with the winner. The winner may only be easier to train for; "
+        "strategy: qp compares bodies without training.",
+    )
+
+
+def _effort(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:
+    """Return whether the winner needs larger efforts than the baseline."""
+    if results.winner is None or results.winner.role == "baseline":
+        return None
+    agent = results.winner.agents[0]
+    row = next((row for row in results.comparison if (row.backend, row.agent) == ("fem", agent)), None)
+    if row is None:
+        return None
+    parts = []
+    for kind in ("mean", "largest"):
+        before, after = (getattr(body, f"{kind}_effort") for body in (row.baseline, row.winner))
+        if before and after and after > COSTLIER * before:
+            effort = snapshot.config.effort
+            parts.append(f"{kind} effort is {effort.text(after)} instead of {effort.text(before)}")
+    if not parts:
+        return None
+    return Finding(
+        "The winner pulls harder",
+        f"On FEM its {' and its '.join(parts)}: part of its gain may be the stronger drive. A study with constraints "
+        "on largest_effort compares bodies at equal drives.",
+    )
 
 
 def _mesh(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:
@@ -137,7 +228,8 @@ def _limit(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:
     interval = mean_interval(policy.table("distances"), qp.table("distances"))
     trained, solved = (measure.text(group.mean.mean_distance) for group in (policy, qp))
     means = f"{measure.label.lower()} is {trained} with its policy and {solved} with the inverse QP"
-    if gain > NEGLIGIBLE * results.success_distance and (interval is None or interval[0] > 0.0):
+    closes = gain > max(NEGLIGIBLE * results.success_distance, SUBSTANTIAL * policy.mean.mean_distance)
+    if closes and (interval is None or interval[0] > 0.0):
         return Finding(
             "The policy limits, not the body",
             f"On the same body the {means}. Train longer (finalists.steps), or let the policy correct the "

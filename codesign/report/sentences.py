@@ -246,6 +246,8 @@ def _origin_of_goals(snapshot: StudySnapshot) -> str:
 def effort_note(snapshot: StudySnapshot) -> str:
     """Return over what the efforts of the test are means, and of what they are the largest."""
     note = "Means are over actuators, steps and goals; the largest is that of any actuator in any step."
+    if len({actuator.unit for actuator in snapshot.config.robot.actuators}) > 1:
+        note += " Actuators of several units are compared by their typical efforts (effort_scale)."
     if snapshot.config.finalists.test == "ends":
         note += " On FEM, they are those at the ends of the episodes."
     return note

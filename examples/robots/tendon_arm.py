@@ -21,7 +21,7 @@ class TendonArm(Robot):
         DesignVariable("offset", 0.005, 0.010, 0.008, "m", "distance of the tendons from the axis"),
     )
     near, far = ("near_1", "near_2", "near_3"), ("far_1", "far_2", "far_3")
-    actuators = tuple(Actuator(name, -0.010, 0.010, 0.0005) for name in near + far)
+    actuators = tuple(Actuator(name, -0.008, 0.008, 0.0005) for name in near + far)
     antagonists = (near, far)  # what one pulls, the others let out
 
     def assemble(self, design):
@@ -36,6 +36,6 @@ class TendonArm(Robot):
         for k, name in enumerate(self.near + self.far):
             angle = 2.0 * np.pi / 3.0 * k + (np.pi / 3.0 if name in self.far else 0.0)
             offset = design["offset"] * np.array([np.cos(angle), np.sin(angle)])
-            model.add_tendon(name, discs[1:11] if name in self.near else discs[1:], offset, compliance=1e-4)
+            model.add_tendon(name, discs[1:11] if name in self.near else discs[1:], offset)
         model.add_effector("tip", model.rods[0].points(length, (0.0, 0.0), model.nodes))
         return model

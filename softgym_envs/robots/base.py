@@ -356,6 +356,12 @@ class Robot(ABC):
         """Largest commanded displacements, shape (n_a,)."""
         return np.array([actuator.high for actuator in self.actuators])
 
+    def effort_sizes(self, efforts: np.ndarray) -> np.ndarray:
+        """Return the sizes of efforts (..., n_a) in one unit: their own, or shares of `effort_scale` if they differ."""
+        mixed = len({actuator.unit for actuator in self.actuators}) > 1
+        sizes: np.ndarray = np.abs(efforts)
+        return sizes / self.effort_scale if mixed else sizes
+
     @property
     def rates(self) -> np.ndarray:
         """Largest change of the command per control step, shape (n_a,)."""

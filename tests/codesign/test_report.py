@@ -211,3 +211,44 @@ def test_wrong_films(tmp_path):
 @pytest.mark.parametrize(("seconds", "text"), [(2.41, "2.4 s"), (59.0, "59.0 s"), (606.0, "10.1 min")])
 def test_times_are_in_seconds_or_minutes(seconds, text):
     assert time_text(seconds) == text
+
+
+def on_surrogate(found, tests, name="distances"):
+    """Write tests on the surrogate: trial -> distances (or untrusted shares, with distances of FEM)."""
+    for number, values in tests.items():
+        distances = np.full(6, 4e-3) if name == "untrusted" else values
+        made = replace(evaluation(distances), untrusted=np.asarray(values if name == "untrusted" else np.zeros(6)))
+        test = FinalistTest(number, "policy", "surrogate", "unseen", 0, made, {"mean_distance": 1.0}, list(distances))
+        test.write(found.path / "finalists" / f"trial{number:04d}-policy-surrogate-unseen.json")
+    return load_study(found)
+
+
+def test_a_surrogate_that_is_not_trusted_is_named(tested):
+    folder = tested(FAR, FAR).folder
+    assert "The surrogate is little trusted" not in titles(on_surrogate(folder, {0: np.zeros(6)}, "untrusted"))
+    found = findings(*_with_results(on_surrogate(folder, {1: np.full(6, 0.88)}, "untrusted")))
+    (text,) = [finding.text for finding in found if finding.title == "The surrogate is little trusted"]
+    assert "100% of the states of the baseline and 12% of the states of the winner" in text
+
+
+def _with_results(snapshot):
+    return snapshot, collect(snapshot)
+
+
+def test_surrogate_and_fem_that_disagree_are_named(tested):
+    folder = tested(4.7e-2 + WIGGLE, FAR).folder
+    snapshot = on_surrogate(folder, {0: [5e-3, 1e-3, 5e-3, 5e-3, 5e-3, 5e-3], 1: np.full(6, 7e-3)})
+    (text,) = [f.text for f in findings(*_with_results(snapshot)) if f.title == "Surrogate and FEM disagree"]
+    assert "of the winner is 7.00 mm on the surrogate" in text and "47.0" in text
+
+
+@pytest.mark.parametrize(("qp", "named"), [(9e-3, True), (4e-3, False)])
+def test_a_baseline_that_the_inverse_qp_prefers_is_named(tested, qp, named):
+    found = titles(tested(NEAR, np.full(6, qp)))
+    assert ("With the inverse QP, the baseline is the better body" in found) == named
+
+
+def test_the_policy_limits_only_where_the_qp_closes_a_substantial_part(tested):
+    """8.23 against 7.94 mm is no reason to train longer."""
+    found = titles(tested(np.full(6, 8.23e-3), np.full(6, 7.94e-3) + 1e-3 * WIGGLE))
+    assert "The body limits, not the policy" in found and "The policy limits, not the body" not in found
