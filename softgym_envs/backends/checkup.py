@@ -115,9 +115,7 @@ def check_robot(
 
 
 def _rest(robot: Robot, statics: Statics) -> Equilibrium:
-    zero = np.zeros(len(robot.actuators))
-    rest = statics.solve(zero, robot.rest_mode)
-    return statics.solve(zero) if robot.rest_mode == "effort" and statics.model.loads.any() else rest
+    return statics.solve(np.zeros(len(robot.actuators)))
 
 
 def _effector(robot: Robot, rest: Equilibrium) -> Finding:

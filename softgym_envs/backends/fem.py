@@ -38,15 +38,15 @@ from softgym_envs.surrogate.domain import FOLDED, LOADED, SOFT, SPREAD
 from softgym_envs.wording import counted
 
 
-def _relax_dynamically(model: MechanicalModel, statics: Statics, command: np.ndarray, mode: str) -> Equilibrium:
+def _relax_dynamically(model: MechanicalModel, statics: Statics, command: np.ndarray) -> Equilibrium:
     """Find an equilibrium that Newton's method misses, by a slow, heavily damped motion towards it."""
     motion_solver = Dynamics(model, step=0.02, stiffness_damping=0.02, tolerance=1e-8)
     for _ in range(200):
-        motion = motion_solver.advance(command, mode)
+        motion = motion_solver.advance(command)
         if np.abs(motion.velocity).max() * model.kinematics.dof_scale.max() < 1e-3:
             break
     statics.restore(motion_solver.x, motion_solver.effort)
-    return statics.solve(command, mode)
+    return statics.solve(command)
 
 
 class FEMBackend(Backend):
@@ -140,12 +140,9 @@ class FEMBackend(Backend):
             statics = self._solver(model)
             zero = np.zeros(len(self.robot.actuators))
             try:
-                rest = statics.solve(zero, self.robot.rest_mode)
-            except ConvergenceError:
-                rest = _relax_dynamically(model, statics, zero, self.robot.rest_mode)
-            if self.robot.rest_mode == "effort" and model.loads.any():
-                # Loads would move the actuators, so they are held.
                 rest = statics.solve(zero)
+            except ConvergenceError:
+                rest = _relax_dynamically(model, statics, zero)
             self._dynamics = Dynamics(model, **self.step_options) if self.moving else None
             self.model, self._statics, self.design = model, statics, complete
             self._rest = self._state(rest, zero, still=True)

@@ -102,7 +102,6 @@ class Robot(ABC):
         goal_tolerance: distance at which a goal counts as reached [m].
         workspace_scale: distance over which the effector typically moves [m], by default a quarter of the size; scales
             rewards and errors.
-        rest_mode: state of the actuators at rest: ``"effort"`` (no effort) or ``"displacement"`` (held at zero).
         learning: what surrogates know of the robot before they learn it.
         sensing: sensors inside the body; none by default.
         view: from where pictures show it.
@@ -127,7 +126,6 @@ class Robot(ABC):
     goal_axes: np.ndarray = np.ones(3)
     goal_tolerance: float = 0.002
     workspace_scale: float
-    rest_mode: str = "effort"
     learning: Learning = Learning()
     sensing: Sensing = Sensing()
     view: View = View()

@@ -48,7 +48,6 @@ class FrictionGripper(FingerRobot):
     holds_by_contact = True
     #: Pulled further, the fingers press the object so much that it turns out of the grip.
     cable_range = (0.0, 0.008)
-    rest_mode = "displacement"
     learning = Learning(convex=False)  # the weight of the object does not scale with Young's modulus
 
     def __init__(

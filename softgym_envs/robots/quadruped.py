@@ -54,7 +54,6 @@ class Quadruped(Robot):
     name = "quadruped"
     effectors = ("trunk",)
     size = 0.1
-    rest_mode = "displacement"
     made_of_beams = True
     goal_axes = np.array([1.0, 1.0, 0.0])
     goal_tolerance = 0.01

@@ -69,7 +69,6 @@ class Tetrapod(Robot):
     name = "tetrapod"
     effectors = ("centre",)
     size = 0.2
-    rest_mode = "displacement"
     made_of_beams = True
     learned_parts = ("leg",)
     backends = {

@@ -62,7 +62,7 @@ def _numbers(robot: Robot, design: Any) -> dict[str, Any]:
 
     statics, zero = Statics(model), np.zeros(len(robot.actuators))
     try:
-        rest = statics.solve(zero, robot.rest_mode)
+        rest = statics.solve(zero)
         found["compliance"] = np.ravel(rest.condensed.compliance).tolist()
     except ConvergenceError:
         pass

@@ -61,7 +61,7 @@ def sample_periods(robot: Robot, plan: SamplingPlan, group: int) -> Periods | No
     try:
         design = plan.designs(robot, group, 1)[0]
         statics = Statics(robot.build(design))
-        rest = statics.solve(np.zeros(len(robot.actuators)), robot.rest_mode)
+        rest = statics.solve(np.zeros(len(robot.actuators)))
     except (InfeasibleDesign, ConvergenceError):
         return None
     rows: list[tuple[np.ndarray, ...]] = []

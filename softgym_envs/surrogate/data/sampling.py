@@ -278,9 +278,7 @@ def sample_group(robot: Robot, plan: SamplingPlan, group: int) -> tuple[dict[str
             return None, plan.states
         model = robot.build(design)
         statics = Statics(model)
-        rest = statics.solve(zero, robot.rest_mode)
-        if robot.rest_mode == "effort" and model.loads.any():
-            rest = statics.solve(zero)
+        rest = statics.solve(zero)
     except (InfeasibleDesign, ConvergenceError):
         return None, plan.states
     rows: list[Equilibrium] = [rest]

@@ -282,9 +282,7 @@ def _solve_body(robot: Robot, commands: Commands, number: int, second_start: boo
         statics = Statics(robot.build(design))
         if not robot.learning.convex:
             statics.unilateral = np.zeros(count, dtype=bool)
-        rest = statics.solve(np.zeros(count), robot.rest_mode)
-        if robot.rest_mode == "effort" and statics.model.loads.any():
-            rest = statics.solve(np.zeros(count))
+        rest = statics.solve(np.zeros(count))
     except (InfeasibleDesign, ConvergenceError):
         return part.rows(np.zeros(0, dtype=np.int64))
     source, image = _repeated(robot, wanted)

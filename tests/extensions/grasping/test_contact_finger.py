@@ -81,7 +81,7 @@ def test_attributes(finger):
 
 def test_rest_is_zero_without_effort(finger):
     robot, model = finger
-    rest = Statics(model).solve(np.zeros(8), robot.rest_mode)
+    rest = Statics(model).solve(np.zeros(8))
     np.testing.assert_allclose(rest.delta[:8], 0.0, atol=1e-12)
     np.testing.assert_allclose(rest.effort, 0.0, atol=1e-12)
     np.testing.assert_allclose(rest.condensed.delta.e, robot.effector_rest, atol=1e-12)

@@ -73,7 +73,6 @@ class ContactAidedFinger(GmshRobot):
     size = 0.1
     view = View(axes=(2, 0, 1))  # it stands along y and closes along x
     goal_axes = np.array([1.0, 1.0, 0.0])
-    rest_mode = "displacement"
     learning = Learning(stiffness_variable="young_modulus", convex=False)
     backends = {
         "surrogate": "softgym_envs.extensions.grasping.backends.chain:ChainBackend",

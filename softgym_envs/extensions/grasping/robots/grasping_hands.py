@@ -120,7 +120,6 @@ class ContactAidedGripper(Robot):
     name = "contact_aided_gripper"
     effectors = ("box",)
     size = 0.1
-    rest_mode = "displacement"
     learning = Learning(convex=False)
     view = View(at_rest=True)
     lifting = Lifting(drive=2, mass="object_mass", friction="friction")
