@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,11 +22,7 @@ from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import ContactModel
 from softgym_envs.mechanics.constraints.cable import Cable
-from softgym_envs.mechanics.contact.contact import ContactMemory
-from softgym_envs.mechanics.contact.obstacles import MeshObstacle
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.solvers.beam_motion import BeamMotion
-from softgym_envs.mechanics.solvers.dynamics import Dynamics, Motion
 from softgym_envs.mechanics.solvers.equilibrium import SATURATED, Equilibrium
 from softgym_envs.mechanics.solvers.exact_compliance import exact_at
 from softgym_envs.mechanics.solvers.learned_errors import possible_errors
@@ -37,9 +33,16 @@ from softgym_envs.robots.base import TOUCH_RADIUS, Robot
 from softgym_envs.surrogate.domain import FOLDED, LOADED, SOFT, SPREAD
 from softgym_envs.wording import counted
 
+if TYPE_CHECKING:
+    from softgym_envs.mechanics.contact.contact import ContactMemory
+    from softgym_envs.mechanics.solvers.beam_motion import BeamMotion
+    from softgym_envs.mechanics.solvers.dynamics import Dynamics, Motion
+
 
 def _relax_dynamically(model: MechanicalModel, statics: Statics, command: np.ndarray) -> Equilibrium:
     """Find an equilibrium that Newton's method misses, by a slow, heavily damped motion towards it."""
+    from softgym_envs.mechanics.solvers.dynamics import Dynamics
+
     motion_solver = Dynamics(model, step=0.02, stiffness_damping=0.02, tolerance=1e-8)
     for _ in range(200):
         motion = motion_solver.advance(command)
@@ -122,6 +125,8 @@ class FEMBackend(Backend):
             return None
         if robot.may_touch and not options.get("dynamics", False):
             return None
+        from softgym_envs.mechanics.contact.obstacles import MeshObstacle
+
         if any(isinstance(obstacle, MeshObstacle) or obstacle.frame is not None for obstacle in robot.obstacles):
             return None  # compiled contact knows neither
         return "softgym_envs.backends.fem_batch:FEMBatch"
@@ -143,7 +148,7 @@ class FEMBackend(Backend):
                 rest = statics.solve(zero)
             except ConvergenceError:
                 rest = _relax_dynamically(model, statics, zero)
-            self._dynamics = Dynamics(model, **self.step_options) if self.moving else None
+            self._dynamics = self._mover(model) if self.moving else None
             self.model, self._statics, self.design = model, statics, complete
             self._rest = self._state(rest, zero, still=True)
             self._own_loads = model.nodal_loads.copy()
@@ -151,6 +156,11 @@ class FEMBackend(Backend):
         self.restore(self._rest)
         self._mode = "displacement"  # mode of the current state's command
         return self.state
+
+    def _mover(self, model: MechanicalModel) -> Dynamics:
+        from softgym_envs.mechanics.solvers.dynamics import Dynamics
+
+        return Dynamics(model, **self.step_options)
 
     def _build(self, design: Design) -> MechanicalModel:
         return self.robot.build(design)
@@ -396,7 +406,8 @@ class FEMBackend(Backend):
 
     def _drive(self, solver: Statics, command: np.ndarray, mode: str, load: np.ndarray | None) -> Any:
         """Solve once, with actuators saturated at their largest effort."""
-        solve = solver.advance if isinstance(solver, Dynamics) else solver.solve
+        moving = self._dynamics if solver is self._dynamics else None
+        solve: Any = solver.solve if moving is None else moving.advance
         limit, count = self.largest_efforts, len(command)
         if mode == "effort":
             return solve(np.clip(command, -limit, limit), mode, effector_force=load)
@@ -408,7 +419,7 @@ class FEMBackend(Backend):
             target = np.where(saturated, sign * limit, command)
             modes = ["effort" if s else "displacement" for s in saturated]
             found = solve(target, modes, effector_force=load)
-            equilibrium = found.equilibrium if isinstance(found, Motion) else found
+            equilibrium = found if moving is None else found.equilibrium
             effort, reached = equilibrium.effort[:count], equilibrium.delta[:count]
             over = ~saturated & (np.abs(effort) > limit)
             # A saturated actuator is released when its command asks for less than it has reached; none after a while,

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softgym_envs.mechanics.elements.beams import Beam, Section
 from softgym_envs.mechanics.elements.block import ElementBlock
-from softgym_envs.mechanics.elements.rigid import RigidBody
 from softgym_envs.mechanics.frames import frame_rows
-from softgym_envs.mechanics.locking import warn_of_locking
 from softgym_envs.mechanics.mesh_checks import check_apart
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.rods import ENDS, Rod, outlines, straight_places, transported_frames
-from softgym_envs.mechanics.skins import tube_skin
 from softgym_envs.mechanics.solids import Fixed, are_rows, described, solid_part
+
+if TYPE_CHECKING:
+    from softgym_envs.mechanics.elements.beams import Section
 
 
 class ModelBuilder:
@@ -130,6 +128,8 @@ class ModelBuilder:
             raise ValueError(
                 f"row {unknown[0]} of the beam is not a frame's first row; frames start at rows {sorted(known)}"
             )
+        from softgym_envs.mechanics.elements.beams import Beam
+
         self._parts.append((Beam, np.asarray(frames, dtype=np.int64), {"section": section, **options}))
 
     def add_rod(
@@ -162,6 +162,9 @@ class ModelBuilder:
         Raises:
             ValueError: for a path or elements that describe no rod.
         """
+        from softgym_envs.mechanics.elements.beams import Section
+        from softgym_envs.mechanics.rods import ENDS, outlines, straight_places, transported_frames
+
         points = np.asarray(path, dtype=float)
         if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2 or not np.isfinite(points).all():
             raise ValueError(f"the path of a rod must be two or more points [m] of three finite numbers, got {path!r}")
@@ -203,6 +206,8 @@ class ModelBuilder:
 
     def add_mass(self, frame: int, mass: float, inertia: np.ndarray) -> None:
         """Assign a mass [kg] and an inertia along the directors [kg m2] (3, 3) to the rigid part at a frame."""
+        from softgym_envs.mechanics.elements.rigid import RigidBody
+
         self._parts.append((RigidBody, np.array(frame), {"mass": mass, "inertia": inertia}))
 
     def build(self) -> MechanicalModel:
@@ -226,11 +231,21 @@ class ModelBuilder:
             gravity=self._gravity,
             solver=self._solver,
         )
+        if self._rods:
+            self._add_rods(model)
+        from softgym_envs.mechanics.locking import warn_of_locking
+
+        warn_of_locking(model)
+        return model
+
+    def _add_rods(self, model: MechanicalModel) -> None:
+        from softgym_envs.mechanics.elements.beams import Beam
+        from softgym_envs.mechanics.rods import Rod
+        from softgym_envs.mechanics.skins import tube_skin
+
         for part, places, outline in self._rods:
-            beam = blocks[part]
+            beam = model.blocks[part]
             assert isinstance(beam, Beam)
             model.rods.append(Rod(beam, places))
             if outline is not None:
-                model.skins.append(tube_skin(beam, nodes, outline))
-        warn_of_locking(model)
-        return model
+                model.skins.append(tube_skin(beam, model.nodes, outline))

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
-from softgym_envs.mechanics.rods import Rod
 from softgym_envs.mechanics.solids import Fixed
+
+if TYPE_CHECKING:
+    from softgym_envs.mechanics.rods import Rod
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,8 @@ def spread(name: str, on: EmbeddedPoints | Rod | Fixed, nodes: np.ndarray) -> tu
     Raises:
         ValueError: if no node is chosen, or the chosen ones do not lie on a straight line.
     """
+    from softgym_envs.mechanics.rods import Rod
+
     if isinstance(on, EmbeddedPoints):
         return on.node_ids.ravel(), on.weights.ravel() / len(on.node_ids)
     if isinstance(on, Rod):

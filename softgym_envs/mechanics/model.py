@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,22 +17,14 @@ from softgym_envs.mechanics.constraints.cavity import ATMOSPHERE, Cavity, Sealed
 from softgym_envs.mechanics.constraints.constraint import Constraint
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
-from softgym_envs.mechanics.contact.contact import Contact, ContactSettings
-from softgym_envs.mechanics.contact.obstacles import MeshObstacle, Obstacle
-from softgym_envs.mechanics.contact.surface import surface_of
 from softgym_envs.mechanics.elements.block import ElementBlock
-from softgym_envs.mechanics.elements.gas import EnclosedGas
 from softgym_envs.mechanics.elements.quadratic import QuadraticTetrahedra, quadratic_triangles
 from softgym_envs.mechanics.elements.tetrahedra import SolidBlock, check_nodes
 from softgym_envs.mechanics.frames import Frames
-from softgym_envs.mechanics.io import UNITS, read_mesh, read_surface, unit_factor
 from softgym_envs.mechanics.kinematics import Kinematics
 from softgym_envs.mechanics.loads import Load, spread
-from softgym_envs.mechanics.locking import warn_of_locking
 from softgym_envs.mechanics.materials import Material
 from softgym_envs.mechanics.mesh_checks import check_held
-from softgym_envs.mechanics.rods import Rod
-from softgym_envs.mechanics.skins import Skin
 from softgym_envs.mechanics.solids import (
     DEFAULT_ELEMENT,
     Fixed,
@@ -47,9 +39,14 @@ from softgym_envs.mechanics.solids import (
     nodes_in_box,
     solid_part,
 )
-from softgym_envs.mechanics.surfaces import cavity_around, cavity_like
-from softgym_envs.mechanics.warping import Warping
 from softgym_envs.quantities import check_quantity, number, numbers
+
+if TYPE_CHECKING:
+    from softgym_envs.mechanics.contact.contact import Contact, ContactSettings
+    from softgym_envs.mechanics.contact.obstacles import MeshObstacle, Obstacle
+    from softgym_envs.mechanics.rods import Rod
+    from softgym_envs.mechanics.skins import Skin
+    from softgym_envs.mechanics.warping import Warping
 
 announce_compilation()
 
@@ -101,8 +98,7 @@ class MechanicalModel:
         gravity: Sequence[float] = (0.0, 0.0, 0.0),
         solver: str = "auto",
     ) -> None:
-        self.nodes = check_nodes(nodes)
-        self.blocks = list(blocks)
+        self.nodes, self.blocks = check_nodes(nodes), list(blocks)
         n = len(self.nodes)
         body_frames = Frames(self.nodes, np.asarray(frames), carried, mounted)
         held = fixed_mask(fixed, n)
@@ -121,9 +117,7 @@ class MechanicalModel:
         self.kinematics = Kinematics(self.nodes, held, body_frames, held_spin)
         if not self.kinematics.equations:
             raise ValueError("every node is clamped, so that nothing can move; clamp only those where the body is held")
-        self.floating = floating
-        self._is_held = floating
-        self.solver = solver
+        self.floating, self._is_held, self.solver = floating, floating, solver
         self.constraints: dict[str, list[Constraint]] = {"a": [], "e": [], "c": [], "s": [], "b": []}
         self.skins: list[Skin] = []
         self.rods: list[Rod] = []
@@ -198,6 +192,8 @@ class MechanicalModel:
         block = part.kind(part.nodes, part.connectivity, **part.options)
         model = cls(part.nodes, [block], fixed=part.fixed, gravity=gravity, solver=solver)
         model._check_held()
+        from softgym_envs.mechanics.locking import warn_of_locking
+
         warn_of_locking(model)
         return model
 
@@ -231,6 +227,8 @@ class MechanicalModel:
             MeshingError: if gmsh cannot be used, or takes too long.
             ValueError: if no node is fixed, or the size of the body is implausible.
         """
+        from softgym_envs.mechanics.io import read_mesh
+
         mesh = read_mesh(path, scale=scale, unit=unit, mesh_size=mesh_size, time_limit=time_limit)
         check_size(mesh.nodes, "for a file in millimetres pass unit='mm', for one in metres unit='m'")
         if (fixed is None) == (fixed_box is None):
@@ -360,18 +358,12 @@ class MechanicalModel:
         """
         if (surface is None) == (inside is None):
             raise ValueError(f"cavity '{name}' needs either its 'surface' or a point 'inside' it")
-        solid = self._solid(block)
-        if surface is None:
+        from softgym_envs.mechanics.chambers import chamber_triangles
+
+        if inside is not None:
             check_distance(inside, self._solid_nodes, f"the point inside cavity '{name}'", 1.0)
-            triangles = cavity_around(self.nodes, solid.corners, np.asarray(inside), name)
-        elif isinstance(surface, str | Path):
-            points, faces, in_metres = read_surface(surface)
-            factors = [1.0] if in_metres else [unit_factor(None, unit)] if unit else list(UNITS.values())
-            triangles = cavity_like(self.nodes, solid.corners, [(f * points, faces) for f in factors], name)
-        else:
-            numbers(surface, f"surface of cavity '{name}'")
-            triangles = np.asarray(surface)
-        cavity = self.cavity(name, triangles, block=block)
+        corners = self._solid(block).corners
+        cavity = self.cavity(name, chamber_triangles(name, self.nodes, corners, surface, inside, unit), block=block)
         self.add("a", cavity)
         return cavity
 
@@ -404,6 +396,8 @@ class MechanicalModel:
         Raises:
             ValueError: if the ambient pressure is not positive and finite.
         """
+        from softgym_envs.mechanics.elements.gas import EnclosedGas
+
         air = SealedAir(cavity, ambient)
         self.blocks.append(EnclosedGas(air))
         self._assembly = self._warping = None
@@ -460,6 +454,9 @@ class MechanicalModel:
             raise ValueError(
                 f"'excluded' must be numbers of rows from 0 to {len(self.nodes) - 1}, got {described(excluded)}"
             )
+        from softgym_envs.mechanics.contact.contact import Contact, ContactSettings
+        from softgym_envs.mechanics.contact.surface import surface_of
+
         settings = ContactSettings(self_contact=True) if settings is None else settings
         if settings.stiffness is None:
             stiffness = 0.1 * max((block.largest_young_modulus for block in self.blocks), default=0.0)
@@ -581,6 +578,8 @@ class MechanicalModel:
     def warping(self) -> Warping:
         """Warping of Newton steps into large motions."""
         if self._warping is None:
+            from softgym_envs.mechanics.warping import Warping
+
             floating = self.floating or bool(self.constraints["b"])
             self._warping = Warping(self.kinematics, self.blocks, solver=self.solver, floating=floating)
         return self._warping

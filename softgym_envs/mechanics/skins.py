@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
-from softgym_envs.mechanics.elements.beams import Beam
-from softgym_envs.mechanics.elements.parts import Port
+
+if TYPE_CHECKING:
+    from softgym_envs.mechanics.elements.beams import Beam
+    from softgym_envs.mechanics.elements.parts import Port
 
 BRIDGE_SECTIONS = 9
 """Outlines along a bar between two frames."""

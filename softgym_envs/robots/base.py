@@ -289,11 +289,11 @@ class Robot(ABC):
         return tuple(obstacle_from(obstacle) for obstacle in obstacles)
 
     def _add_contact(self, model: MechanicalModel, design: Mapping[str, float]) -> None:
-        from softgym_envs.mechanics.contact.contact import ContactSettings
-
         obstacles = (*self.own_obstacles(model, design), *self.obstacles)
         if not obstacles and not self.self_contact:
             return
+        from softgym_envs.mechanics.contact.contact import ContactSettings
+
         if model.contact is not None:
             raise ValueError(f"robot '{self.name}' adds its own contact and does not take obstacles or self_contact")
         model.set_contact(

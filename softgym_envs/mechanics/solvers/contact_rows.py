@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple, Self
+from typing import TYPE_CHECKING, NamedTuple, Self
 
 import numpy as np
 
 from softgym_envs.mechanics.condensation import ContactModel, Row
-from softgym_envs.mechanics.contact.contact import ContactRow
 from softgym_envs.mechanics.solvers.equilibrium import RowLayout
+
+if TYPE_CHECKING:
+    from softgym_envs.mechanics.contact.contact import ContactRow
 
 
 class ContactRows(NamedTuple):

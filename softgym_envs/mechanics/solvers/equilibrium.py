@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, TypedDict
+from typing import TYPE_CHECKING, NamedTuple, TypedDict
 
 import numpy as np
 
 from softgym_envs.mechanics.condensation import CondensedModel, Roles, Row
-from softgym_envs.mechanics.contact.contact import ContactMemory, Contacts
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.solvers.cable_friction import CableMemory
+
+if TYPE_CHECKING:
+    from softgym_envs.mechanics.contact.contact import ContactMemory, Contacts
+    from softgym_envs.mechanics.solvers.cable_friction import CableMemory
 
 SATURATED = 1.0 - 1e-9
 """Part of its largest effort from which an actuator counts as saturated: round-off."""

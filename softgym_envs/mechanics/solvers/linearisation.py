@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from scipy.sparse import csc_matrix, hstack
 
 from softgym_envs.mechanics.assembly import Assembled, Inertia
-from softgym_envs.mechanics.contact.contact import ContactMemory, ContactState, ContactTerms
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.cable_friction import CableFriction, CableMemory, FrictionTerms
 from softgym_envs.mechanics.solvers.tangent import Tangent
+
+if TYPE_CHECKING:
+    from softgym_envs.mechanics.contact.contact import ContactMemory, ContactState, ContactTerms
 
 
 class Linearisation:
@@ -50,7 +54,11 @@ class Linearisation:
         self.assembly = model.assembly
         self.loads = np.zeros_like(model.nodes)
         self.inertia: Inertia | None = None
-        self.contact = None if model.contact is None else ContactState(model.contact, model.kinematics, model.nodes)
+        self.contact: ContactState | None = None
+        if model.contact is not None:
+            from softgym_envs.mechanics.contact.contact import ContactState
+
+            self.contact = ContactState(model.contact, model.kinematics, model.nodes)
         self.cable_friction = CableFriction.of(model)
         self.current = False
         self.located = True
@@ -78,11 +86,16 @@ class Linearisation:
 
     def remember(self, x: np.ndarray, memory: ContactMemory | CableMemory | None) -> None:
         """Set the memory of friction; without one, friction starts anew at rows ``x`` (n, 3)."""
-        for rubbing, kind in ((self.contact, ContactMemory), (self.cable_friction, CableMemory)):
-            if rubbing is not None and isinstance(memory, kind):
-                rubbing.memory = memory
-            elif rubbing is not None:
-                rubbing.begin(x)
+        if self.contact is not None:
+            if memory is None or isinstance(memory, CableMemory):
+                self.contact.begin(x)
+            else:
+                self.contact.memory = memory
+        if self.cable_friction is not None:
+            if isinstance(memory, CableMemory):
+                self.cable_friction.memory = memory
+            else:
+                self.cable_friction.begin(x)
         self.current = False
 
     @property
