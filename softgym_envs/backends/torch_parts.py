@@ -145,7 +145,7 @@ class TorchParts:
             model = self._robot.build(design)
             (parts,) = (block for block in model.blocks if isinstance(block, PoseParts))
             statics = Statics(model)
-            rest = statics.solve(np.zeros(self.count), self._robot.rest_mode)
+            rest = statics.solve(np.zeros(self.count))
             found = {
                 "forms": parts.forms,
                 "linear": parts.linear,

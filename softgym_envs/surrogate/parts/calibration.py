@@ -82,7 +82,7 @@ def approach(statics: Statics, robot: Robot, command: np.ndarray) -> Equilibrium
     Raises:
         ConvergenceError: if it is not found.
     """
-    found = statics.solve(np.zeros(len(command)), robot.rest_mode)
+    found = statics.solve(np.zeros(len(command)))
     for share in np.linspace(0.0, 1.0, INCREMENTS + 1)[1:]:
         found = statics.solve(share * command)
     return found
