@@ -294,7 +294,10 @@ def account(robot: Robot, card: Mapping[str, Any]) -> list[str]:
     for split, states in card["states"].items():
         bodies, commands = card.get("lost", {}).get(split, (0, 0))
         unstable = card["unstable_states_left_out"][split]
-        kinds = ((bodies, "body", "that cannot be built or held"), (commands, "command", "without an equilibrium"))
+        kinds: tuple[tuple[int, str, str], ...] = (
+            (bodies, "body", "that cannot be built or held"),
+            (commands, "command", "without an equilibrium"),
+        )
         kinds = (*kinds, (unstable, "state", "too unstable to learn"))
         parts = [f"{counted(n, name)} {why}" for n, name, why in kinds if n]
         lines.append(f"{split}: {counted(states, 'state')}; lost: {', '.join(parts) or 'nothing'}")
