@@ -143,6 +143,7 @@ def write_film(path: Path, episodes: Sequence[Episode]) -> None:
 
 
 def _record(path: Path, episodes: Sequence[Episode]) -> None:
+    from softgym_envs.viewer.moment import Moment
     from softgym_envs.viewer.recording import RolloutRecorder
 
     roles, scale = [episode.role for episode in episodes], episodes[0].task.distance_scale
@@ -151,15 +152,8 @@ def _record(path: Path, episodes: Sequence[Episode]) -> None:
             recorder.begin(episode.role)
             for step, state in enumerate(episode.states):
                 goals, goal = episode.drawn_goal(step)
-                recorder.log(
-                    step,
-                    episode.design,
-                    state,
-                    goal,
-                    path=goals,
-                    reward=episode.rewards[step],
-                    distance=episode.distances[step],
-                )
+                reward, distance = episode.rewards[step], episode.distances[step]
+                recorder.log(Moment(step, episode.design, state, goal, goals, reward, distance))
 
 
 def _comparable(winner: Winner) -> bool:

@@ -164,8 +164,9 @@ def rollout(
     from softgym_envs.agents.evaluation import check_agent, make_agent
     from softgym_envs.surrogate.domain import distrust_text
     from softgym_envs.viewer.gltf import GlbWriter
+    from softgym_envs.viewer.moment import Watcher
     from softgym_envs.viewer.paraview import ParaviewWriter
-    from softgym_envs.viewer.recording import Filmed, Watcher, recorder_of, watch_rollout
+    from softgym_envs.viewer.recording import Filmed, recorder_of, watch_rollout
 
     if record is not None and record.suffix != ".rrd":
         raise ConfigError(f"recording '{record}' must end with .rrd; --video writes films")

@@ -18,6 +18,7 @@ from softgym_envs.errors import ConfigError
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Robot
 from softgym_envs.storage import atomic_write
+from softgym_envs.viewer.moment import Moment
 from softgym_envs.viewer.scene import COLORS, STUB, Color
 from softgym_envs.viewer.surface import BodySurface, ShapeFinder, cable_lines, surface_kinds
 
@@ -65,24 +66,14 @@ class GlbWriter:
             with atomic_write(self.path) as stream:
                 stream.write(self._content())
 
-    def log(
-        self,
-        step: int,
-        design: Mapping[str, float],
-        state: State,
-        goal: np.ndarray,
-        *,
-        path: np.ndarray | None = None,
-        reward: float | None = None,
-        distance: float | None = None,
-    ) -> None:
-        """Add one state; see `RolloutRecorder.log`.
+    def log(self, moment: Moment, /) -> None:
+        """Add one state.
 
         Raises:
             ConfigError: if the body has another mesh than the one before.
         """
-        self.add(design, state)
-        self._goals.append(np.asarray(goal, dtype=float).reshape(-1, 3)[0])
+        self.add(moment.design, moment.state)
+        self._goals.append(np.asarray(moment.goal, dtype=float).reshape(-1, 3)[0])
 
     def add(self, design: Mapping[str, float], state: State) -> None:
         """Add one state without a goal."""

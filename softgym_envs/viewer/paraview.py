@@ -15,6 +15,7 @@ from softgym_envs.extras import require
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Robot
 from softgym_envs.storage import atomic_write
+from softgym_envs.viewer.moment import Moment
 from softgym_envs.viewer.surface import BodySurface, ShapeFinder, cable_lines, surface_kinds
 
 if TYPE_CHECKING:
@@ -67,18 +68,9 @@ class ParaviewWriter:
             with atomic_write(self.folder / f"{part}.pvd", "w") as stream:
                 stream.write(f"{text}  </Collection>\n</VTKFile>\n")
 
-    def log(
-        self,
-        step: int,
-        design: Mapping[str, float],
-        state: State,
-        goal: np.ndarray,
-        *,
-        path: np.ndarray | None = None,
-        reward: float | None = None,
-        distance: float | None = None,
-    ) -> None:
-        """Write one state; see `RolloutRecorder.log`."""
+    def log(self, moment: Moment, /) -> None:
+        """Write one state."""
+        step, design, state = moment.step, moment.design, moment.state
         model = self._shapes.load(design)
         x = self._shapes.nodes(design, state)
         if model is not self._model:
@@ -88,7 +80,7 @@ class ParaviewWriter:
         self._write("skin", step, self._skin(x))
         if lines := cable_lines(model, x, state, stub=0.0):
             self._write("cables", step, _cables(lines, state))
-        self._write("points", step, _points(state, goal, reward))
+        self._write("points", step, _points(state, moment.goal, moment.reward))
         if state.contacts is not None:
             touch = state.contacts
             self._write("contacts", step, _cloud(touch.point, force=touch.force, gap=touch.gap))

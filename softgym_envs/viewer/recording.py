@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol
+from typing import Any
 
 import gymnasium
 import numpy as np
 
-from softgym_envs.backends.backend import State
 from softgym_envs.envs.env import SoftRobotEnv
 from softgym_envs.envs.tasks.base import LENGTHS, DistanceScale
 from softgym_envs.extras import require
@@ -18,6 +17,7 @@ from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Robot
 from softgym_envs.storage import atomic_write
 from softgym_envs.units import display, effort_unit
+from softgym_envs.viewer.moment import Moment, Watcher
 from softgym_envs.viewer.scene import COLORS, STUB, tension_color
 from softgym_envs.viewer.surface import BodySurface, ShapeFinder, cable_lines
 
@@ -109,32 +109,12 @@ class RolloutRecorder:
             with atomic_write(self.path) as file:
                 file.write(content)
 
-    def log(
-        self,
-        step: int,
-        design: Mapping[str, float],
-        state: State,
-        goal: np.ndarray,
-        *,
-        path: np.ndarray | None = None,
-        reward: float | None = None,
-        distance: float | None = None,
-    ) -> None:
-        """Log one state.
-
-        Args:
-            step: control step.
-            design: the body.
-            state: its state; a state without nodes is drawn in the shape of a finite-element model.
-            goal: the current goal [m], shape (3,).
-            path: all goals of the episode [m], shape (p, 3).
-            reward: reward of the step to this state; None after a reset.
-            distance: distance to the goal as the task measures it [m]; default: Euclidean.
-        """
+    def log(self, moment: Moment, /) -> None:
+        """Log one state."""
         import rerun
 
-        size = self.robot.size
-        self._stream.set_time("step", sequence=step)
+        size, design, state, goal, path = self.robot.size, moment.design, moment.state, moment.goal, moment.path
+        self._stream.set_time("step", sequence=moment.step)
         model = self._shapes.load(design)
         x = self._shapes.nodes(design, state)
         self._log_body(model, x)
@@ -152,11 +132,12 @@ class RolloutRecorder:
             goals = rerun.LineStrips3D([path], radii=0.005 * size, colors=COLORS["goal"])
             self._stream.log(f"{self._root}world/path", goals)
 
+        distance = moment.distance
         if distance is None:
             distance = float(np.linalg.norm(state.effector[0] - goal))
         self._plot("distance", self.distance_scale.factor * distance)
-        if reward is not None:
-            self._plot("reward", reward)
+        if moment.reward is not None:
+            self._plot("reward", moment.reward)
         for row, actuator in enumerate(self.robot.actuators):
             self._plot(f"displacement/{actuator.name}", display(actuator.unit).factor * state.displacement[row])
             self._plot(f"effort/{actuator.name}", state.effort[row])
@@ -258,22 +239,6 @@ def _limit(env: gymnasium.Env, steps: int | None) -> int:
     return limit
 
 
-class Watcher(Protocol):
-    """Takes the states of a rollout, as `RolloutRecorder.log` describes."""
-
-    def log(
-        self,
-        step: int,
-        design: Mapping[str, float],
-        state: State,
-        goal: np.ndarray,
-        *,
-        path: np.ndarray | None = None,
-        reward: float | None = None,
-        distance: float | None = None,
-    ) -> None: ...
-
-
 class Filmed:
     """Watcher that keeps a picture of each state.
 
@@ -285,7 +250,7 @@ class Filmed:
     def __init__(self, env: gymnasium.Env, frames: list[Any]) -> None:
         self.env, self.frames = env, frames
 
-    def log(self, step: int, design: Mapping[str, float], state: State, goal: np.ndarray, **shown: Any) -> None:
+    def log(self, moment: Moment, /) -> None:
         """Draw the environment as it is now."""
         self.frames.append(self.env.render())
 
@@ -306,9 +271,9 @@ def watch_rollout(
 
     def log(step: int, reward: float | None) -> None:
         path, goal = body.task.drawn_goals(body.state, body.path, body.goal)
-        distance = float(info["distance"])
+        moment = Moment(step, body.design, body.state, goal, path, reward, float(info["distance"]))
         for watcher in watchers:
-            watcher.log(step, body.design, body.state, goal, path=path, reward=reward, distance=distance)
+            watcher.log(moment)
 
     log(0, None)
     total, step, over, distrust_codes = 0.0, 0, False, [int(info["distrust"])]

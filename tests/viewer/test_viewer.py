@@ -11,6 +11,7 @@ from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.viewer.image import ImageRenderer, render_bodies, render_body
+from softgym_envs.viewer.moment import Moment
 from softgym_envs.viewer.recording import RolloutRecorder, record_rollout
 from softgym_envs.viewer.scene import COLORS, tension_color
 from softgym_envs.viewer.surface import BodySurface, ShapeFinder, cable_lines, slacken
@@ -250,7 +251,7 @@ class TestRecording:
             for role in recorder.roles:
                 recorder.begin(role)
                 for step, name in enumerate(("rest", "bent")):
-                    recorder.log(step, backend.design, states[name], np.zeros(3))
+                    recorder.log(Moment(step, backend.design, states[name], np.zeros(3)))
         chunk = pytest.importorskip("rerun.chunk")
         rows = {}
         for part in chunk.RrdReader(path).stream():
