@@ -146,6 +146,25 @@ class CorrectedQPAgent(ModelQPAgent):
         return command
 
 
+class GaitAgent:
+    """The reference gait of the robot, which is the same for all bodies.
+
+    Args:
+        seed: not used.
+    """
+
+    title = "common gait"
+
+    def __init__(self, seed: int = 0) -> None:
+        pass
+
+    def __call__(self, observation: Any, env: Any) -> np.ndarray:
+        """Return the action that leads towards the next command of the gait, shape (n_a,)."""
+        gait = env.robot.reference_gait()
+        action: np.ndarray = env.spaces.action(gait[(env.steps + 1) % len(gait)], env.command)
+        return action
+
+
 class RandomAgent:
     """Uniform actions; those of `Robot.antagonists` are balanced.
 
@@ -175,6 +194,7 @@ BASELINES = Table(
         "qp_static": f"{__name__}:StaticQPAgent",
         "qp_model": f"{__name__}:ModelQPAgent",
         "qp_pi": f"{__name__}:CorrectedQPAgent",
+        "gait": f"{__name__}:GaitAgent",
         "random": f"{__name__}:RandomAgent",
     },
     group="softgym_envs.agents",
@@ -189,8 +209,8 @@ def make_baseline(name: str, seed: int = 0) -> Agent:
         name: ``"qp"``: inverse QP on the condensed model of the plant's present state, in dynamics of its next time
             step, unless the task names another agent for its goals (`Task.qp_agent`); ``"qp_static"``: on the static
             equilibrium under the present command, without momentum; ``"qp_model"``: on the surrogate, whatever the
-            plant is; ``"qp_pi"``: as ``"qp_model"``, with a PI controller on the measured effector; ``"random"``:
-            uniform actions; or one of an installed package.
+            plant is; ``"qp_pi"``: as ``"qp_model"``, with a PI controller on the measured effector; ``"gait"``: the
+            reference gait of the robot; ``"random"``: uniform actions; or one of an installed package.
         seed: seed of the random agent.
 
     Raises:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict
 
@@ -44,6 +44,7 @@ class Evaluation:
             ``info``), shape (n,); NaN if it is not known.
         largest_efforts: largest effort of any actuator in any step of each episode [N, ...], shape (n,); NaN if it is
             not known.
+        tallies: what the task counts (`Task.tallies`), at the end of each episode [SI], each of shape (n,).
         seconds: wall-clock time [s].
         cpu_seconds: CPU time of this process [s].
     """
@@ -57,6 +58,7 @@ class Evaluation:
     steps: int
     untrusted: np.ndarray | None = None
     largest_efforts: np.ndarray | None = None
+    tallies: dict[str, np.ndarray] = field(default_factory=dict)
     seconds: float = 0.0
     cpu_seconds: float = 0.0
 
@@ -103,7 +105,8 @@ class Evaluation:
     def merge(cls, parts: Sequence[Evaluation]) -> Evaluation:
         """Join evaluations on different goals into one evaluation on all of them; costs add up."""
         columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _PER_GOAL}
-        return cls(**columns, **_total_cost(parts))
+        tallies = {name: np.concatenate([part.tallies[name] for part in parts]) for name in parts[0].tallies}
+        return cls(**columns, tallies=tallies, **_total_cost(parts))
 
     @classmethod
     def average(cls, repeats: Sequence[Evaluation]) -> Evaluation:
@@ -115,13 +118,17 @@ class Evaluation:
         if len({len(repeat) for repeat in repeats}) != 1:
             raise ValueError(f"numbers of goals must be equal, got {[len(repeat) for repeat in repeats]}")
         columns = {name: np.mean([getattr(repeat, name) for repeat in repeats], axis=0) for name in _PER_GOAL}
-        return cls(**columns, **_total_cost(repeats))
+        names = repeats[0].tallies
+        tallies = {name: np.mean([repeat.tallies[name] for repeat in repeats], axis=0) for name in names}
+        return cls(**columns, tallies=tallies, **_total_cost(repeats))
 
     def to_json(self) -> dict[str, Any]:
         """Return everything as plain data: the summary, the values for each goal and the cost."""
         summary = {name: none_for_nan(getattr(self, name)) for name in _SUMMARY}
         columns = {name: none_for_nan(getattr(self, name)) for name in _PER_GOAL}
-        return {**summary, **columns, "steps": self.steps, "seconds": self.seconds, "cpu_seconds": self.cpu_seconds}
+        tallies = {name: none_for_nan(values) for name, values in self.tallies.items()}
+        cost = {"steps": self.steps, "seconds": self.seconds, "cpu_seconds": self.cpu_seconds}
+        return {**summary, **columns, "tallies": tallies, **cost}
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Evaluation:
@@ -135,15 +142,17 @@ class Evaluation:
                 data = {"tracking_distances": data["mean_distances"], **data}
             data = {**{name: np.full(np.size(data["distances"]), np.nan) for name in _LATER}, **data}
             columns = {name: _column(data[name]) for name in _PER_GOAL}
+            tallies = {name: _column(values) for name, values in data.get("tallies", {}).items()}
             cost = int(data["steps"]), float(data["seconds"]), float(data["cpu_seconds"])
         except (KeyError, TypeError, ValueError) as error:
             raise DataError(f"stored evaluation cannot be read: {type(error).__name__} {error}") from None
-        shapes = {name: column.shape for name, column in columns.items()}
+        found = {**columns, **tallies}
+        shapes = {name: column.shape for name, column in found.items()}
         count = np.size(columns["distances"])
-        expected = {name: (count, 3) if name == "ends" else (count,) for name in _PER_GOAL}
-        if shapes != expected or any(column.dtype.kind not in "bif" for column in columns.values()):
+        expected = {name: (count, 3) if name == "ends" else (count,) for name in found}
+        if shapes != expected or any(column.dtype.kind not in "bif" for column in found.values()):
             raise DataError(f"stored evaluation must hold numbers for each goal, got shapes {shapes}")
-        return cls(**columns, steps=cost[0], seconds=cost[1], cpu_seconds=cost[2])
+        return cls(**columns, tallies=tallies, steps=cost[0], seconds=cost[1], cpu_seconds=cost[2])
 
 
 def none_for_nan(values: Any) -> Any:
@@ -352,15 +361,17 @@ def _evaluate_one_by_one(
     finally:
         env.close()
     columns: dict[str, Any] = {name: np.array([row[name] for row in rows]) for name in _PER_GOAL}
-    return Evaluation(**columns, steps=sum(row["steps"] for row in rows))
+    tallies = {name: np.array([row["tallies"][name] for row in rows]) for name in rows[0]["tallies"]}
+    return Evaluation(**columns, tallies=tallies, steps=sum(row["steps"] for row in rows))
 
 
 def _run_episode(env: gymnasium.Env, act: Agent, seed: int, options: dict[str, Any]) -> dict[str, Any]:
     """Return what `Evaluation` says of one episode, by the names of its columns, and its steps."""
     observation, info = env.reset(seed=seed, options=options)
     total, effort, largest, distance, untrusted, steps, ended = 0.0, 0.0, 0.0, 0.0, 0, 0, False
+    inner: Any = env.unwrapped
     while not ended:
-        observation, reward, terminated, truncated, info = env.step(act(observation, env.unwrapped))
+        observation, reward, terminated, truncated, info = env.step(act(observation, inner))
         total += float(reward)
         efforts = env.unwrapped.robot.effort_sizes(info["effort"])  # type: ignore[attr-defined]
         effort, largest = effort + float(efforts.mean()), max(largest, float(efforts.max()))
@@ -377,6 +388,7 @@ def _run_episode(env: gymnasium.Env, act: Agent, seed: int, options: dict[str, A
         "ends": info["effector"],
         "untrusted": untrusted / steps,
         "largest_efforts": largest,
+        "tallies": {name: info[name] for name in inner.task.tallies},
         "steps": steps,
     }
 
@@ -394,6 +406,7 @@ def _evaluate_together(
         act = Policy(agent).begin()
     distances, totals, returns, efforts, largest, untrusted, lengths = np.zeros((7, count))
     successes, running, ends = np.zeros(count, dtype=bool), np.ones(count, dtype=bool), np.zeros((count, 3))
+    tallies = {name: np.zeros(count) for name in env.unwrapped.task.tallies}
     try:
         observation, _ = env.reset(seed=seed, options={"design": design, "goal": goals})
         while running.any():
@@ -401,6 +414,8 @@ def _evaluate_together(
             last = info.get("final_info", info)
             distances[running], ends[running] = last["distance"][running], last["effector"][running]
             successes[running] = (last["is_success"] & last["converged"])[running]
+            for name, values in tallies.items():
+                values[running] = last[name][running]
             totals += running * last["distance"]
             returns += running * reward
             effort = env.unwrapped.robot.effort_sizes(last["effort"])
@@ -420,5 +435,6 @@ def _evaluate_together(
         ends=ends,
         untrusted=untrusted / lengths,
         largest_efforts=largest,
+        tallies=tallies,
         steps=int(lengths.sum()),
     )

@@ -108,7 +108,9 @@ def environment_sections(identifier: str) -> dict[str, Callable[[], str]]:
             (3, wanted, reach, goal_unit),
             (3, difference, f"x / (1 + abs(x)) of it over {error}", goal_unit),
         ]
-        if task.sensors:
+        if task.sensors is not None and task.sensors.parts:
+            parts = [parts[0], *task.sensors.parts, (3, "wanted velocity x, y, z", reach, goal_unit)]
+        elif task.sensors:
             count = len(robot.sensing.scale)
             unit_seen = robot.sensing.unit
             volumes = f"x / (1 + abs(x)) of it over {quantity(float(robot.sensing.scale[0]), unit_seen)}"
@@ -187,15 +189,16 @@ def environment_sections(identifier: str) -> dict[str, Callable[[], str]]:
         )
 
     def information() -> str:
-        error = "relative error of the force" if forces else f"{along} [m]"
-        limit = f"{task.success_distance:g}" if forces else quantity(task.success_distance, "m")
+        error = "relative error of the force" if forces else f"{along} [{goal_unit}]"
+        limit = f"{task.success_distance:g}" if forces else quantity(task.success_distance, goal_unit)
+        counted = f", {', '.join(f'`{name}`' for name in task.tallies)} (what the task counts)" if task.tallies else ""
         return (
             f"`effector` [m], `goal` [{goal_unit}], `measured` [{goal_unit}] (what is compared with the goal), "
             f"`distance` ({error.strip()}), `is_success` (`distance` < "
             f"{limit}), `is_failed`, `reward_*` (the terms of the reward), `displacement` [{unit}], `effort` "
-            f"[{force_unit}], `stable` (FEM: the tangent is positive definite), `converged`. `env.unwrapped.state` is "
-            "the whole mechanical state, with the condensed model at `env.unwrapped.state.condensed` (`W.ea`, "
-            "`delta_free.e`, ...)."
+            f"[{force_unit}]{counted}, `stable` (FEM: the tangent is positive definite), `converged`. "
+            "`env.unwrapped.state` is the whole mechanical state, with the condensed model at "
+            "`env.unwrapped.state.condensed` (`W.ea`, `delta_free.e`, ...)."
         )
 
     def arguments() -> str:

@@ -27,6 +27,7 @@ PERCENT = Display("%", 100.0, 1)
 DISPLAYS = {
     "m": Display("mm", 1e3, 2),
     "m3": Display("cm3", 1e6, 2),
+    "m/s": Display("mm/s", 1e3, 1),
     "rad": Display("deg", 180.0 / math.pi, 1),
     "Pa": Display("kPa", 1e-3, 0),
     "J": Display("mJ", 1e3, 2),

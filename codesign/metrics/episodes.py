@@ -13,6 +13,9 @@ from softgym_envs.units import PERCENT
 if TYPE_CHECKING:
     from softgym_envs.mechanics.model import MechanicalModel
 
+SLOWEST = 1e-3
+"""Speed that ratios to the speed have at least [m/s]."""
+
 
 @metric(direction="maximize", shown=PERCENT)
 def success_rate(outcome: Outcome) -> np.ndarray:
@@ -54,6 +57,38 @@ def largest_effort(outcome: Outcome) -> np.ndarray | None:
 def untrusted_share(outcome: Outcome) -> np.ndarray | None:
     """Return the share of the steps of each episode in which the surrogate does not trust itself."""
     return outcome.evaluation.untrusted
+
+
+def _tally(outcome: Outcome, name: str) -> np.ndarray:
+    found = outcome.evaluation.tallies.get(name)
+    if found is None:
+        raise ValueError(f"metrics of walking need episodes of task 'walk', which count '{name}'")
+    return found
+
+
+@metric("m/s", "maximize")
+def walking_speed(outcome: Outcome) -> np.ndarray:
+    """Return the speed ahead."""
+    return _tally(outcome, "speed")
+
+
+@metric()
+def walking_drift(outcome: Outcome) -> np.ndarray:
+    """Return the way sideways over the way ahead."""
+    return _tally(outcome, "drift") / np.maximum(_tally(outcome, "speed"), SLOWEST)
+
+
+@metric()
+def walking_slip(outcome: Outcome) -> np.ndarray:
+    """Return the way on which loaded points slip over the way ahead."""
+    return _tally(outcome, "slip") / np.maximum(_tally(outcome, "speed"), SLOWEST)
+
+
+@metric()
+def cost_of_transport(outcome: Outcome) -> np.ndarray:
+    """Return the work of the actuators over weight and way ahead."""
+    weight = outcome.model.mass * float(np.linalg.norm(outcome.robot.gravity))
+    return _tally(outcome, "power") / (weight * np.maximum(_tally(outcome, "speed"), SLOWEST))
 
 
 @metric("m3", source="body")

@@ -106,6 +106,7 @@ class Episodes:
         self._remembers = self._reads_states or type(task).begin is not Task.begin
         copies = [copy.deepcopy(task, {id(self.robot): self.robot}) for _ in range((count - 1) * self._remembers)]
         self._tasks = [task, *copies] if self._remembers else [task] * count
+        self._records = type(task).record is not Task.record
         self.spaces = setup.spaces(moving=self.backend.moving)
         self.unit_designs = self._space.observe(self.designs, self.spaces.design_names)
         self.generators: list[np.random.Generator | None] = [None] * count
@@ -197,6 +198,7 @@ class Episodes:
                     own.load.begin(random)
                 if own.sensors is not None:
                     own.sensors.begin()
+        self._record(index)
 
     def _begin_bodies(self, index: np.ndarray, designs: np.ndarray) -> dict[int, InfeasibleDesign]:
         """Give some rows bodies; those that cannot exist are left as they were and returned."""
@@ -290,6 +292,14 @@ class Episodes:
                 self.backend.push([None if f is None else f / self.stiffness[i] for i, f in enumerate(loads)])
         self.backend.step(arriving)
         self.steps += 1
+        self._record(np.arange(len(self._tasks)))
+
+    def _record(self, index: np.ndarray) -> None:
+        """Show the present states of some rows to their tasks, if these take note of them."""
+        if self._records:
+            states = self._states()
+            for i in index.tolist():
+                self._tasks[i].record(states[i])
 
     def report(self, index: np.ndarray | None = None) -> tuple[np.ndarray, Any, dict[str, Any]]:
         """Return observations (B, d), rewards (B,) and infos of the present states; ``alone`` without the axis of rows.
@@ -301,14 +311,14 @@ class Episodes:
         state, goals = self._present(states), self.goals()[only]
         measured = state.effector[..., :3]
         if self._reads_states:
-            measured = np.stack([task.measure(one) for one in states])[only]
+            measured = np.stack([self._tasks[i].measure(one) for i, one in enumerate(states)])[only]
         distance, terms, reward = task.rate(measured, goals, self.spaces.effort_share(state.effort))
         failed = np.zeros(reward.shape, dtype=bool)
         if self._reads_states:
             further = [self._tasks[i].state_terms(one) for i, one in enumerate(states)]
-            for name in further[0]:
-                terms[name] = np.array([row[name] for row in further])[only]
-                reward = reward * terms[name]
+            if further[0]:
+                terms = terms | {name: np.array([row[name] for row in further])[only] for name in further[0]}
+                reward = task.reward(terms)
             failed = np.array([self._tasks[i].is_failed(one) for i, one in enumerate(states)])[only]
         info: dict[str, Any] = {
             "measured": measured.copy(),
@@ -326,6 +336,9 @@ class Episodes:
             "distrust": state.distrust,
             "converged": state.converged,
         }
+        if task.tallies:
+            counted = [each.tally() for each in self._tasks]
+            info |= {name: np.array([row[name] for row in counted])[only] for name in task.tallies}
         if states and states[0].contacts is not None:
             info |= {name: values[only] for name, values in _contact_info(states).items()}
         if self.plants is not None:
@@ -333,7 +346,8 @@ class Episodes:
                 info[f"plant_{field.name}"] = np.array([getattr(plant, field.name) for plant in self.plant])[only]
         readings = measured[..., :0]
         if task.sensors is not None:
-            readings = np.stack([task.sensors.readings(one) for one in states])[only]
+            sensing: list[Any] = [each.sensors for each in self._tasks]
+            readings = np.stack([sensing[i].readings(one) for i, one in enumerate(states)])[only]
         shown = self._read(Sensed(state.displacement, state.effort, measured, readings), index)
         velocity = self.backend.velocity
         observation = self.spaces.observe(

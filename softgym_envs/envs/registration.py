@@ -98,6 +98,7 @@ ENVIRONMENTS: dict[str, EnvironmentRow] = {
     "SoftGym/TetrapodReach-v0": environment_row("tetrapod", "reach", 100, backend="fem", backend_options=DYNAMIC),
     "SoftGym/TetrapodTrack-v0": environment_row("tetrapod", "track", 100, backend="fem", backend_options=DYNAMIC),
     "SoftGym/TetrapodCarry-v0": environment_row("tetrapod", "carry", 100, backend="fem", backend_options=DYNAMIC),
+    "SoftGym/QuadrupedWalk-v0": environment_row("quadruped", "walk", 100, backend="fem", backend_options=DYNAMIC),
 }
 """All environments of a robot with a task, by ID; `register_environment` and installed packages add to them."""
 

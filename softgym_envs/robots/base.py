@@ -107,6 +107,8 @@ class Robot(ABC):
         view: from where pictures show it.
         made_of_beams: bodies are quadratic beams and rigid parts, moved by servos or chambers; finite elements step
             many of them at once.
+        body_frame: row of the model with the origin of the frame that carries the body, of robots that move about; its
+            directors follow. None for robots that are mounted.
         backends: backends of its own, ``"module:class"``, by the name that they replace or add.
         learned_parts: names of the parts that `assemble` takes from `parts`, if there are any there.
         parts: learned parts by name: functions of a design and of gravity that return the options of the element; see
@@ -130,6 +132,7 @@ class Robot(ABC):
     sensing: Sensing = Sensing()
     view: View = View()
     made_of_beams: bool = False
+    body_frame: int | None = None
     backends: Mapping[str, str] = {}
     learned_parts: tuple[str, ...] = ()
     parts: Mapping[str, Callable[[Mapping[str, float], np.ndarray], dict[str, Any]]] = {}
@@ -204,6 +207,14 @@ class Robot(ABC):
         raise ValueError(
             f"robot '{self.name}' has no reference path: define reference_path, or pass task_options={{'path': points}}"
         )
+
+    def reference_gait(self) -> np.ndarray:
+        """Return the commands of one period of a plain gait, one for each control step, shape (p, n_a).
+
+        Raises:
+            ValueError: if the robot has none.
+        """
+        raise ValueError(f"robot '{self.name}' has no reference gait: define reference_gait")
 
     def displacements(self, fractions: np.ndarray) -> np.ndarray:
         """Return the commands, shape (N, n_a), at which states are sampled, for points of the unit cube (N, n_a).

@@ -34,6 +34,10 @@ CHAMBER_OFFSET, CHAMBER_RADIUS = 0.5625, 0.375
 """Distance of the chambers from the axis of a leg and their radius, in radii of the leg."""
 CORNERS = 8
 """Corners of the section of a leg as it touches the ground."""
+PERIOD = 10
+"""Control steps of a period of the trot."""
+TROT = 2.0e-8
+"""Volume by which it swings and stretches a leg [m3]."""
 START = 0.95
 """Gap below the feet where the search for the equilibrium begins, in distances of contact."""
 
@@ -54,6 +58,7 @@ class Quadruped(Robot):
     name = "quadruped"
     effectors = ("trunk",)
     size = 0.1
+    body_frame = 0
     made_of_beams = True
     goal_axes = np.array([1.0, 1.0, 0.0])
     goal_tolerance = 0.01
@@ -139,6 +144,12 @@ class Quadruped(Robot):
     def own_obstacles(self, model: MechanicalModel, design: Mapping[str, float]) -> Sequence[Obstacle]:
         normal = _turned(-self.slope)[:, 2].tolist()
         return (Plane((0.0, 0.0, 0.0), normal, friction=self.friction, name="ground"),)
+
+    def reference_gait(self) -> np.ndarray:
+        """Trot, shape (10, 8): diagonal legs swing and stretch together, the other two half a period later."""
+        phase = 2.0 * np.pi * np.arange(PERIOD)[:, None] / PERIOD + np.pi * np.array([0.0, 1.0, 1.0, 0.0])
+        swing, stretch = np.sin(phase), 0.5 * (1.0 + np.cos(phase))
+        return TROT * np.stack([stretch - swing, stretch + swing], axis=2).reshape(PERIOD, -1)
 
     def reference_path(self, count: int = 30) -> np.ndarray:
         """Straight ahead by two lengths of the trunk, shape (count, 3)."""

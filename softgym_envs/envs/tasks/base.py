@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial, reduce
 from operator import mul
@@ -198,9 +198,11 @@ class Sensors(ABC):
 
     Attributes:
         count: number of values.
+        parts: for each part of the readings its size, what it is, how it is scaled and its SI unit.
     """
 
     count: int
+    parts: tuple[tuple[int, str, str, str], ...] = ()
 
     @abstractmethod
     def begin(self) -> None:
@@ -242,6 +244,7 @@ class Task(ABC):
         qp_agent: the agent that ``"qp"`` stands for; another one where an inverse QP on the effector cannot follow the
             goals.
         distance_scale: how people read distances, and the unit of goals.
+        tallies: what `tally` counts; such values are in ``info`` and, at the ends of episodes, in evaluations.
         needs_state: whether the task reads whole mechanical states, one after the other, since it has methods of its
             own that take one: `measure`, `state_terms` or `is_failed`.
         robot: the robot.
@@ -261,6 +264,7 @@ class Task(ABC):
     agents: tuple[str, ...] = ("qp", "qp_model", "qp_pi", "random")
     qp_agent: str = "qp"
     distance_scale: DistanceScale = LENGTHS
+    tallies: tuple[str, ...] = ()
     needs_state: bool = False
 
     def __init_subclass__(cls, **options: object) -> None:
@@ -317,6 +321,13 @@ class Task(ABC):
     def begin(self, rng: np.random.Generator) -> None:  # noqa: B027 - optional
         """Draw whatever else is random in an episode of a single environment; nothing by default."""
 
+    def record(self, state: State) -> None:  # noqa: B027 - optional
+        """Take note of a state, at the start of an episode and after each control step; nothing by default."""
+
+    def tally(self) -> dict[str, float]:
+        """Return what the episode amounts to so far, by the names in `tallies` [SI]."""
+        return {}
+
     def measure(self, state: State) -> np.ndarray:
         """Return what is compared with the goal, shape (3,): the first effector [m] unless a task overrides it."""
         return state.effector[0]
@@ -339,8 +350,12 @@ class Task(ABC):
         return False
 
     def state_terms(self, state: State) -> dict[str, float]:
-        """Return further factors of the reward, each in [0, 1]; none by default."""
+        """Return further terms of the reward; none by default."""
         return {}
+
+    def reward(self, terms: Mapping[str, Array]) -> Array:
+        """Return the reward that terms make: their product, unless a task says otherwise."""
+        return reduce(mul, terms.values())
 
     def distance(self, effector: Array, goal: Array) -> Array:
         """Return the distance [m] (...) of effectors to goals, each (..., 3), along the axes that count."""
@@ -373,11 +388,11 @@ class Task(ABC):
         """
         near, far = self._nearness(distance)
         log = namespace(distance).log
-        reward = reduce(mul, self.reward_terms(distance, effort_share).values()).clip(SMALLEST_REWARD, None)
+        reward = self.reward(self.reward_terms(distance, effort_share)).clip(SMALLEST_REWARD, None)
         return log(reward) + 0.5 * log(near * far) - log(0.5 * near + 0.5 * far)
 
     def rate(self, effector: Array, goal: Array, effort_share: Array) -> tuple[Array, dict[str, Array], Array]:
-        """Return distances to the goal [m], the factors of the reward, and the reward, which is their product.
+        """Return distances to the goal [m], the terms of the reward, and the reward.
 
         Args:
             effector: first effector [m], shape (..., 3).
@@ -386,4 +401,4 @@ class Task(ABC):
         """
         distance = self.distance(effector, goal)
         terms = self.reward_terms(distance, effort_share)
-        return distance, terms, reduce(mul, terms.values())
+        return distance, terms, self.reward(terms)

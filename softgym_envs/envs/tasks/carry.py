@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from functools import reduce
-from operator import mul
-
 import numpy as np
 
 from softgym_envs.envs.arrays import Array, namespace
@@ -96,4 +93,4 @@ class Carry(Task):
     def rate(self, effector: Array, goal: Array, effort_share: Array) -> tuple[Array, dict[str, Array], Array]:
         shortfall = goal[..., 0] - effector[..., 0]
         terms = self.reward_terms(shortfall, effort_share)
-        return shortfall.clip(min=0.0), terms, reduce(mul, terms.values())
+        return shortfall.clip(min=0.0), terms, self.reward(terms)

@@ -16,6 +16,7 @@ TASKS = Registry(
         "reach": "softgym_envs.envs.tasks.reach:Reach",
         "track": "softgym_envs.envs.tasks.track:Track",
         "carry": "softgym_envs.envs.tasks.carry:Carry",
+        "walk": "softgym_envs.envs.tasks.walk:Walk",
     },
     base="softgym_envs.envs.tasks.base:Task",
     group="softgym_envs.tasks",

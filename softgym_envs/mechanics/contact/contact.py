@@ -34,6 +34,7 @@ class Contacts:
         self_force: sum of the normal forces between surfaces, of the model and of meshed obstacles [N].
         mesh_force: force of each meshed obstacle on the model [N], zero for others, shape (o, 3).
         smallest_gap: to any obstacle or between surfaces of the model [m]; inf beyond the distance of contact.
+        number: of each point among those of the surface, shape (k,); None on learned chains.
     """
 
     obstacles: tuple[str, ...]
@@ -46,6 +47,7 @@ class Contacts:
     self_force: float
     mesh_force: np.ndarray
     smallest_gap: float
+    number: np.ndarray | None = None
 
     @property
     def count(self) -> int:
@@ -536,6 +538,7 @@ class ContactState:
             self_force=self_force,
             mesh_force=mesh_force,
             smallest_gap=smallest,
+            number=joined([touch.points for touch in touches], ()).astype(np.int64),
         )
 
 

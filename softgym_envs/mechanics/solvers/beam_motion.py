@@ -587,4 +587,5 @@ def contacts_of(contact: Contact, points: ContactPoints, slides: Slides, x: np.n
         self_force=0.0,
         mesh_force=np.zeros((len(names), 3)),
         smallest_gap=float(values[:, 3].min(initial=np.inf)),
+        number=numbers[:, 1],
     )
