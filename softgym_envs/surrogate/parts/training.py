@@ -45,10 +45,10 @@ class PartData(Config):
         seed: of bodies, commands, dimensions and shifts.
     """
 
-    bodies: int = Field(default=400, gt=1)
+    bodies: int = Field(default=320, gt=1)
     steps: int = Field(default=48, gt=0)
     copies: int = Field(default=4, gt=0)
-    boundary: float = Field(default=0.4, ge=0.0, le=1.0)
+    boundary: float = Field(default=0.0, ge=0.0, le=1.0)
     seed: int = Field(default=0, ge=0)
 
 
@@ -62,7 +62,7 @@ class PartNetwork(TrainingOptions):
 
     width: int = Field(default=128, gt=0)
     depth: int = Field(default=3, gt=0)
-    steps: int = Field(default=8000, gt=0)
+    steps: int = Field(default=6000, gt=0)
     batch_size: int = Field(default=384, gt=0)
     learning_rate: float = Field(default=3e-3, gt=0)
 
