@@ -117,7 +117,7 @@ def calibrate_trust(
     from softgym_envs.surrogate.calibration import calibrate
 
     body = options.robot_of(robot, options_)
-    if body.learned_parts:
+    if body.learning.parts:
         from softgym_envs.surrogate.parts.calibration import calibrate_parts
 
         found_of_parts = calibrate_parts(weights, body.learned_mesh(), bodies=bodies, seed=seed)

@@ -427,12 +427,13 @@ class TorchVectorEnv(VectorEnv[Tensor, Tensor, Tensor]):
 def _backend_of(row: EnvironmentRow) -> str | None:
     """Return the backend of an ID on tensors: bodies of learned parts have one, whatever the default of their ID is."""
     found = ROBOTS.resolve(row.robot) if isinstance(row.robot, str) else row.robot
-    return "surrogate" if getattr(found, "learned_parts", ()) else row.backend
+    learning = getattr(found, "learning", None)
+    return "surrogate" if learning is not None and learning.parts else row.backend
 
 
 def _model_of(setup: Setup, device: torch.device, dtype: torch.dtype) -> TorchBatch | TorchParts:
     """Return what finds the states of many bodies: of learned parts, or of one learned model."""
-    if setup.robot.learned_parts:
+    if setup.robot.learning.parts:
         return TorchParts(setup.robot, device, dtype, **setup.backend_options)
     return TorchBatch(standalone_model(setup.robot, **setup.backend_options), device, dtype)
 
@@ -454,7 +455,7 @@ def _check_setup(id: str, setup: Setup) -> None:
     if setup.backend != "surrogate":
         supported = [name for name, other in ENVIRONMENTS.items() if _backend_of(other) == "surrogate"]
         raise ValueError(f"id = {id!r} is not an environment on the surrogate; allowed: {', '.join(supported)}")
-    if setup.backend_options.get("dynamics", False) and not setup.robot.learned_parts:
+    if setup.backend_options.get("dynamics", False) and not setup.robot.learning.parts:
         raise ValueError("dynamics is not available on tensors; allowed: False, or gymnasium.make_vec")
     if setup.plants is not None:
         raise ValueError("plant is not available on tensors; allowed: None, or gymnasium.make_vec")

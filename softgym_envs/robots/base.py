@@ -110,9 +110,8 @@ class Robot(ABC):
         body_frame: row of the model with the origin of the frame that carries the body, of robots that move about; its
             directors follow. None for robots that are mounted.
         backends: backends of its own, ``"module:class"``, by the name that they replace or add.
-        learned_parts: names of the parts that `assemble` takes from `parts`, if there are any there.
-        parts: learned parts by name: functions of a design and of gravity that return the options of the element; see
-            `of_parts`.
+        parts: the parts that `learning` names, where `assemble` shall use them: functions of a design and of gravity
+            that return the options of the element; see `of_parts`.
         reproduces_scene: whether the mesh is that of a published scene, whose elements may lock; others warn once.
         non_mechanical_options: options that do not change the condensed model.
     """
@@ -134,7 +133,6 @@ class Robot(ABC):
     made_of_beams: bool = False
     body_frame: int | None = None
     backends: Mapping[str, str] = {}
-    learned_parts: tuple[str, ...] = ()
     parts: Mapping[str, Callable[[Mapping[str, float], np.ndarray], dict[str, Any]]] = {}
     design_boxes: Mapping[str, Mapping[str, tuple[float, float]]] = {}
     non_mechanical_options: tuple[str, ...] = ("unilateral", "design_box")
@@ -279,13 +277,13 @@ class Robot(ABC):
         return torch.stack(columns, dim=-1)
 
     def of_parts(self, parts: Mapping[str, Callable[[Mapping[str, float], np.ndarray], dict[str, Any]]]) -> Robot:
-        """Return the robot whose bodies have learned parts in place of finite elements; see `learned_parts`."""
+        """Return the robot whose bodies have learned parts in place of finite elements; see `Learning`."""
         made = copy.copy(self)
         made.parts = parts
         return made
 
     def learned_mesh(self) -> Robot:
-        """Return the robot on the mesh from which its `learned_parts` were learned."""
+        """Return the robot on the mesh from which its parts were learned."""
         return self
 
     def printable(self) -> Robot:

@@ -44,6 +44,7 @@ class Learning:
             Surrogates also learn from the images of their states.
         loads: design variables that say what acts on the body, not what the body is.
         touch: how a touch is learned; None if it is not.
+        parts: names of the parts of bodies that are learned instead of whole bodies; see `Robot.of_parts`.
     """
 
     weights: str = ""
@@ -52,6 +53,7 @@ class Learning:
     symmetries: tuple[Symmetry, ...] = ()
     loads: tuple[str, ...] = ()
     touch: LearnedTouch | None = None
+    parts: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

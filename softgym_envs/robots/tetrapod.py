@@ -25,6 +25,7 @@ from softgym_envs.mechanics.frames import frame_rows
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.skins import box_skin, curve_skin, tube_skin
 from softgym_envs.robots.base import Actuator, Robot
+from softgym_envs.robots.capabilities import Learning
 from softgym_envs.robots.mesh_tiers import choose_mesh
 
 HORN = 22.5e-3
@@ -70,7 +71,7 @@ class Tetrapod(Robot):
     effectors = ("centre",)
     size = 0.2
     made_of_beams = True
-    learned_parts = ("leg",)
+    learning = Learning(parts=("leg",))
     backends = {
         "surrogate": "softgym_envs.backends.parts:PartsBackend",
         "hybrid": "softgym_envs.backends.parts:PartsHybridBackend",
