@@ -90,6 +90,8 @@ def pretrained_model(robot: Robot, weights: str | Path | None = None, members: i
     folder = Path(weights) if weights is not None else pretrained_folder(robot)
     if weights is None and not folder.is_dir():
         shipped = list(shipped_robots())
+        if robot.may_touch:
+            raise WeightsError(f"no weights ship for '{folder.name}', which touches something: use backend='fem'")
         raise WeightsError(
             f"no weights ship for '{folder.name}': use backend='fem', or fit weights with 'softgym fit' and pass "
             f"backend_options={{'weights': folder}}; shipped: {', '.join(shipped) or 'none'}"
