@@ -83,9 +83,23 @@ def read_value(text: str) -> Any:
     """Return the value of YAML text.
 
     Raises:
-        yaml.YAMLError: if the text is not valid YAML.
+        yaml.YAMLError: if the text is not valid YAML, or an alias stands for what it is in.
     """
-    return yaml.load(text, Loader=_Loader)
+    value = yaml.load(text, Loader=_Loader)
+    _check_cycles(value, set(), set())
+    return value
+
+
+def _check_cycles(node: Any, around: set[int], checked: set[int]) -> None:
+    if not isinstance(node, dict | list) or id(node) in checked:
+        return
+    if id(node) in around:
+        raise yaml.constructor.ConstructorError(problem="an alias stands for what it is in")
+    around.add(id(node))
+    for part in [*node, *node.values()] if isinstance(node, dict) else node:
+        _check_cycles(part, around, checked)
+    around.remove(id(node))
+    checked.add(id(node))
 
 
 CONFIGS = Path(__file__).parent / "configs"
@@ -135,6 +149,11 @@ def load_config(path: str | Path | None, model: type[ModelT], overrides: Sequenc
         file, name = (path.parent, path.name) if path.parent.is_file() else (path, None)
         data = _read_file(file)
         if several := data.get(ENTRIES):
+            groups = isinstance(several, dict) and all(isinstance(own, dict | None) for own in several.values())
+            if not groups or not isinstance(data.get("defaults"), dict | None):
+                raise ConfigError(f"config '{file}': {ENTRIES} and defaults must be groups of keys and values")
+            several = {str(key): own for key, own in several.items()}
+            data = {**data, ENTRIES: several}
             allowed = ", ".join(several)
             if name is None:
                 raise ConfigError(f"config '{path}' holds several: add the name of one; allowed: {allowed}")

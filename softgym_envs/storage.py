@@ -45,6 +45,10 @@ def atomic_write(path: str | Path, mode: str = "wb") -> Iterator[IO[Any]]:
         raise
 
 
+LARGEST_ARCHIVE = 8_000_000_000
+"""Largest size of the arrays of an npz file [bytes]. A small file may claim any size and fill the memory."""
+
+
 def read_npz(path: str | Path, names: tuple[str, ...], optional: tuple[str, ...] = ()) -> dict[str, np.ndarray]:
     """Return arrays by name from an npz file, without unpickling objects; ``optional`` ones if they are there.
 
@@ -55,10 +59,15 @@ def read_npz(path: str | Path, names: tuple[str, ...], optional: tuple[str, ...]
 
     try:
         with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as data:
+            size = sum(member.file_size for member in data.zip.infolist())
+            if size > LARGEST_ARCHIVE:
+                raise DataError(f"'{path}' would unpack to {size / 1e9:.3g} GB; allowed: {LARGEST_ARCHIVE / 1e9:g} GB")
             missing = sorted(set(names) - set(data.files))
             if missing:
                 raise DataError(f"'{path}' lacks {', '.join(missing)}")
             return {name: data[name] for name in (*names, *(name for name in optional if name in data.files))}
+    except TypeError:
+        raise DataError(f"'{path}' holds one array; expected an npz file of {', '.join(names)}") from None
     except (OSError, ValueError, EOFError, KeyError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
         raise DataError(f"'{path}' cannot be read: {_reason(error)}") from error
 

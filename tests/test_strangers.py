@@ -146,6 +146,9 @@ def test_an_edited_configuration_does_not_relabel_the_results_beside_it(edit, tm
         ("trials: 1:30.5\n", "line 1: '1:30.5' is no decimal number"),
         ("trials: 089\n", "line 1: '089' is no decimal number"),
         ("trials: " + "[" * 5000, "nested too deeply"),
+        ("problem: &p {design: *p}", "not valid YAML: an alias stands for what it is in"),
+        ("configurations: [first]", "configurations and defaults must be groups of keys"),
+        ("defaults: 3\nconfigurations: {first: {}}", "configurations and defaults must be groups of keys"),
     ],
 )
 def test_yaml_is_read_as_people_read_it(text, message, tmp_path):
@@ -278,3 +281,18 @@ def test_impossible_submissions_are_refused(changes):
 def test_names_of_strangers_are_no_markup():
     shown = _escaped("<script>alert(1)</script> [x](javascript:y) | a\nb")
     assert not set("<>[]()|\n") & set(shown)
+
+
+def test_an_archive_does_not_fill_the_memory(tmp_path, monkeypatch):
+    from softgym_envs import storage
+
+    path = tmp_path / "states.npz"
+    np.savez_compressed(path, states=np.zeros(1_000_000))
+    assert path.stat().st_size < 20_000
+    assert storage.read_npz(path, ("states",))["states"].shape == (1_000_000,)
+    monkeypatch.setattr(storage, "LARGEST_ARCHIVE", 7_000_000)
+    with pytest.raises(DataError, match=r"states.npz' would unpack to 0.008 GB; allowed: 0.007 GB"):
+        storage.read_npz(path, ("states",))
+    np.save(tmp_path / "one.npy", np.zeros(3))
+    with pytest.raises(DataError, match="one.npy' holds one array; expected an npz file of states"):
+        storage.read_npz(tmp_path / "one.npy", ("states",))
