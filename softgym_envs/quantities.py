@@ -207,7 +207,7 @@ def numbers(value: object, label: str, unit: str = "1") -> np.ndarray:
     return array.astype(float)
 
 
-def number(value: object, label: str, unit: str = "1") -> float:
+def finite_number(value: object, label: str, unit: str = "1") -> float:
     """Return a finite number.
 
     Raises:

@@ -194,6 +194,14 @@ MISTAKES = {
         lambda _: make_robot("tetrapod", payload=1000.0),
         "robot 'tetrapod': payload = 1000 kg *(1000 g)?*",
     ),
+    "size of a robot in cm": (
+        lambda _: type("Large", (Bar,), {"size": 1.1})().build(),
+        "robot 'bar': size = 1.1 m does not fit the body that assemble returns, which extends over 0.104 m; allowed: *",
+    ),
+    "typical effort in mN": (
+        lambda _: type("Strong", (Bar,), {"effort_scale": np.array([2e5])})(),
+        "robot 'bar': effort_scale of actuator 'pull' = 200000 N *; did you mean 200 N (2e+05 mN)?*",
+    ),
     "payload of some grams": (
         lambda _: make_robot("tetrapod", payload=10.0),
         "robot 'tetrapod': payload = 10 kg *lift*; did you mean 0.01 kg (10 g)?*",

@@ -14,6 +14,7 @@ from softgym_envs.mechanics.cells import cell_shape, tetrahedra_of, triangles_of
 from softgym_envs.mechanics.elements.tetrahedra import boundary_triangles, orient_corners
 from softgym_envs.mechanics.mesh_files import WITH_UNIT, file_format, read_file
 from softgym_envs.mechanics.volume_meshing import fill_surface
+from softgym_envs.quantities import finite_number
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}
 """Metres in each unit of length."""
@@ -68,7 +69,7 @@ def unit_factor(scale: float | None, unit: str | None) -> float:
         raise ValueError(f"pass either scale or unit, got scale = {scale:g} and unit = '{unit}'")
     if unit is not None and unit not in UNITS:
         raise ValueError(unknown_name("unit", unit, UNITS))
-    if scale is not None and not (np.isfinite(scale) and scale > 0.0):
+    if scale is not None and not finite_number(scale, "scale") > 0.0:
         raise ValueError(f"scale = {scale} must be positive and finite")
     return UNITS[unit] if unit is not None else scale if scale is not None else 1.0
 
@@ -194,7 +195,9 @@ def _read(
     states_unit = file_format(path) in WITH_UNIT
     if states_unit and scale is not None:
         raise ValueError(f"scale = {scale:g} must be left out for '{path}', which states its unit")
-    if mesh_size is not None and not (np.isfinite(mesh_size) and mesh_size > 0.0):
+    if not finite_number(time_limit, "time_limit", "s") > 0.0:
+        raise ValueError(f"time_limit = {time_limit} s must be positive")
+    if mesh_size is not None and not finite_number(mesh_size, "mesh_size", "m") > 0.0:
         raise ValueError(f"mesh_size = {mesh_size} m must be positive and finite")
     if states_unit:
         factor = 1.0

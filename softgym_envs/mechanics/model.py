@@ -39,7 +39,7 @@ from softgym_envs.mechanics.solids import (
     nodes_in_box,
     solid_part,
 )
-from softgym_envs.quantities import check_quantity, number, numbers
+from softgym_envs.quantities import check_quantity, finite_number, numbers
 
 if TYPE_CHECKING:
     from softgym_envs.mechanics.contact.contact import Contact, ContactSettings
@@ -266,7 +266,7 @@ class MechanicalModel:
             ValueError: if a point is farther from the body than the body's size, or the body does not reach into its
                 radius.
         """
-        solid, radius = self._solid(block), number(radius, f"radius of {name}", "m")
+        solid, radius = self._solid(block), finite_number(radius, f"radius of {name}", "m")
         check_distance(points, self._solid_nodes, name, 1.0)
         at = np.asarray(points, dtype=float)
         return solid.embed_average(at, self.nodes, radius) if radius else solid.embed(at, self.nodes, hint)

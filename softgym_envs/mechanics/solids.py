@@ -15,7 +15,7 @@ from softgym_envs.mechanics.elements.averaged import AveragedTetrahedra
 from softgym_envs.mechanics.elements.quadratic import EDGES, QuadraticTetrahedra, add_midside_nodes
 from softgym_envs.mechanics.elements.tetrahedra import SolidBlock, Tetrahedra, check_nodes
 from softgym_envs.mechanics.mesh_checks import check_mesh
-from softgym_envs.quantities import check_quantity, number, numbers
+from softgym_envs.quantities import check_quantity, finite_number, numbers
 
 SOLIDS: dict[str, type[SolidBlock]] = {
     kind.element: kind for kind in (Tetrahedra, AveragedTetrahedra, QuadraticTetrahedra)
@@ -83,7 +83,7 @@ def solid_part(
     for name, value in (("young_modulus", young_modulus), ("poisson_ratio", poisson_ratio)):
         options[name] = _element_values(name, value, nodes, tetrahedra, regions or {})
     if total_mass is not None:
-        if not number(total_mass, "total_mass", "kg") > 0.0:
+        if not finite_number(total_mass, "total_mass", "kg") > 0.0:
             raise ValueError(f"total_mass = {total_mass} kg must be positive and finite")
         density = total_mass / kind(nodes, tetrahedra).volume  # type: ignore[call-arg]
         check_quantity(

@@ -15,6 +15,7 @@ from softgym_envs.errors import DataError
 from softgym_envs.mechanics.constraints.cavity import enclosed_volume
 from softgym_envs.mechanics.gmsh_process import GmshFailure, run_gmsh
 from softgym_envs.mechanics.surfaces import connected_pieces, encloses, self_intersection
+from softgym_envs.quantities import finite_number
 
 _ANGLES = (40.0, 80.0, np.nan)
 """Ways to fill a surface: triangles that meet at a larger angle [degrees] form an edge of the shape; NaN: as it is."""
@@ -54,8 +55,8 @@ def fill_surface(
     if len(triangles) < 4:
         raise DataError(f"'{source}' holds no closed surface: it has {len(triangles)} triangles")
     diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
-    size = diagonal / 20.0 if mesh_size is None else float(mesh_size)
-    if not (np.isfinite(size) and size > 0.0):
+    size = diagonal / 20.0 if mesh_size is None else finite_number(mesh_size, "mesh_size", "m")
+    if not size > 0.0:
         raise ValueError(f"mesh_size = {mesh_size} m must be positive and finite")
     if size > diagonal:
         raise ValueError(

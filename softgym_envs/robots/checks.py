@@ -64,6 +64,12 @@ OPTIONS = {
 }
 """Quantity of each option of a robot that has a unit, by name; robots of other packages share these names."""
 
+_EFFORTS = {"m": "force", "rad": "force", "m3": "pressure"}
+"""Quantity of an actuator's effort, by its unit."""
+
+LARGEST_RATIO = 8.0
+"""Ratio of a robot's size and the extent of its baseline body, either way, beyond which one has a wrong unit."""
+
 _REQUIRED = ("name", "effectors", "size", "design_space", "actuators", "effector_rest", "effort_scale")
 
 
@@ -155,6 +161,9 @@ def _check_quantities(robot: Robot) -> None:
         if actuator.unit in strokes:
             example = f"for a robot of size {size:g} m"
             check_by_unit(actuator.unit, furthest, label, high=strokes[actuator.unit], example=example)
+    for actuator, effort in zip(robot.actuators, robot.effort_scale.tolist(), strict=True):
+        if actuator.unit in _EFFORTS:
+            check_quantity(_EFFORTS[actuator.unit], effort, f"{owner}effort_scale of actuator '{actuator.name}'")
     for variable in robot.design_space:
         if variable.unit == "m":
             furthest, label = max(variable.low, variable.high, key=abs), f"{owner}design variable '{variable.name}'"
@@ -280,6 +289,12 @@ def check_built(robot: Robot, model: Any, design: Mapping[str, float]) -> None:
             )
     check_modulus([block.largest_young_modulus for block in model.blocks])
     check_size(model.places, f"scale what {owner} assembles to metres")
+    extent = float(np.linalg.norm(np.ptp(model.places, axis=0)))
+    if not robot.size / LARGEST_RATIO < extent < LARGEST_RATIO * robot.size and design == robot.design_space.baseline:
+        raise ValueError(
+            f"{owner}: size = {robot.size:g} m does not fit the body that assemble returns, which extends over "
+            f"{extent:.3g} m; allowed: {extent / LARGEST_RATIO:.3g} to {LARGEST_RATIO * extent:.3g} m"
+        )
     for block in model.blocks:
         if isinstance(block, RigidBody):
             high, example = CARRIED * robot.size**3, f"what a robot of size {robot.size:g} m may carry"

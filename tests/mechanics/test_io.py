@@ -433,7 +433,8 @@ def test_faulty_surfaces_are_rejected(tmp_path, fault):
     [
         (6.0, r"mesh_size = 6 m is larger than the body, whose diagonal is 0.0663 m; did you mean metres\?"),
         (0.0, "mesh_size = 0.0 m must be positive"),
-        (np.nan, "mesh_size = nan m must be positive"),
+        (np.nan, r"mesh_size = nan must be one finite number \[m\]"),
+        ("6 mm", r"mesh_size = .6 mm. must be a number \[m\]"),
     ],
 )
 def test_malformed_mesh_sizes_are_rejected(tmp_path, size, message):

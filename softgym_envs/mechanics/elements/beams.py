@@ -23,7 +23,7 @@ from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.elements.beam_kernels import interpolate, pull_back, strains
 from softgym_envs.mechanics.elements.block import ElementBlock, StrainRates, lower_pairs
 from softgym_envs.mechanics.elements.tetrahedra import check_density, element_masses
-from softgym_envs.quantities import number, numbers
+from softgym_envs.quantities import finite_number, numbers
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Section:
     @classmethod
     def rectangle(cls, width: float, thickness: float) -> Section:
         """A rectangle with a width [m] along d_2 and a thickness [m] along d_3 (Timoshenko's torsion series)."""
-        width, thickness = number(width, "width", "m"), number(thickness, "thickness", "m")
+        width, thickness = finite_number(width, "width", "m"), finite_number(thickness, "thickness", "m")
         if not (width > 0.0 and thickness > 0.0):
             raise ValueError(f"a section of {width} m by {thickness} m must have positive sides")
         area = width * thickness
@@ -75,7 +75,7 @@ class Section:
     @classmethod
     def circle(cls, radius: float, inner: float = 0.0) -> Section:
         """A circle or, with an ``inner`` radius, a tube [m]."""
-        radius, inner = number(radius, "radius", "m"), number(inner, "inner radius", "m")
+        radius, inner = finite_number(radius, "radius", "m"), finite_number(inner, "inner radius", "m")
         if not 0.0 <= inner < radius:
             raise ValueError(f"radii of a section must be 0 <= inner < radius, got {inner} and {radius} m")
         area = np.pi * (radius**2 - inner**2)

@@ -13,7 +13,7 @@ from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.elements.block import ElementBlock, StrainRates, lower_pairs
 from softgym_envs.mechanics.elements.damping import resist, strain_rates
 from softgym_envs.mechanics.materials import Material, lame_parameters, resolve_material
-from softgym_envs.quantities import check_quantity, number
+from softgym_envs.quantities import check_quantity, finite_number
 
 FACES = np.array([(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)])
 """Corners of the faces of a positively oriented tetrahedron, seen counter-clockwise from outside."""
@@ -220,7 +220,7 @@ def check_density(density: float) -> float:
     Raises:
         ValueError: if it is negative or not finite.
     """
-    found = number(density, "density", "kg/m3")
+    found = finite_number(density, "density", "kg/m3")
     check_quantity("density", found, "density")
     return found
 
