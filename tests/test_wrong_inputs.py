@@ -214,7 +214,7 @@ MISTAKES = {
     ),
     "backend": (
         lambda _: gymnasium.make(REACH, backend="femm"),
-        "unknown backend 'femm'; did you mean 'fem'? allowed: fem, surrogate, hybrid",
+        "unknown backend 'femm'; did you mean 'fem'? allowed: fem, surrogate, hybrid, hardware",
     ),
     "task option": (
         lambda _: gymnasium.make(REACH, task_options={"spred": 0.1}),
