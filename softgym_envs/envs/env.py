@@ -245,7 +245,10 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
     def _report(self, index: np.ndarray | None = None) -> tuple[np.ndarray, float, dict[str, Any]]:
         """Return observation, reward and info of the present state; the sensors are read anew unless in no row."""
         observation, reward, info = self._episodes.report(index)
-        return observation, float(reward), {name: _with_dtype(value) for name, value in info.items()}
+        for name, value in info.items():
+            if (typed := _TYPED.get(type(value))) is not None:
+                info[name] = typed(value)
+        return observation, float(reward), info
 
     def render(self) -> np.ndarray | None:
         """Return an image (height, width, 3) of the body, its cables, effector and goal.
@@ -293,11 +296,6 @@ def _option_texts(robot: Robot, task: Task) -> dict[str, str]:
     return texts
 
 
-# Gymnasium batches arrays of booleans, but not NumPy's boolean scalars.
+# Values of ``info`` get a dtype, which TorchRL reads. Gymnasium batches arrays of booleans, but not NumPy's boolean
+# scalars.
 _TYPED: dict[type, Callable[[Any], Any]] = {bool: np.array, np.bool_: np.array, int: np.int64, float: np.float64}
-
-
-def _with_dtype(value: Any) -> Any:
-    """Return a value of ``info`` with a dtype, which TorchRL reads."""
-    typed = _TYPED.get(type(value))
-    return value if typed is None else typed(value)

@@ -124,7 +124,7 @@ class Episodes:
         self.plant = [own] * count
         self.stiffness, self.noise = np.ones((count, 1)), np.zeros(count)
         self.delay = np.zeros(count, dtype=np.int64)
-        self._inexact = np.zeros(count, dtype=bool)  # rows whose drives do something else than they are commanded to
+        self._inexact: set[int] = set()  # rows whose drives do something else than they are commanded to
         self._drives = {name: np.tile(getattr(own, name), (count, n_a)) for name in ("gain", "offset", "backlash")}
         # The last command is kept too, if the drives did something else.
         longest = 0 if self.plants is None else self.plants.longest_delay + (not self.plants.drive_exactly)
@@ -231,7 +231,8 @@ class Episodes:
 
     def set_plant(self, i: int, plant: Plant) -> None:
         """Give a row another plant, but for its cables."""
-        self.plant[i], self._inexact[i] = plant, not plant.drives_exactly
+        self.plant[i] = plant
+        (self._inexact.discard if plant.drives_exactly else self._inexact.add)(i)
         self.stiffness[i], self.noise[i], self.delay[i] = plant.stiffness, plant.noise, plant.delay
         for name, values in self._drives.items():
             values[i] = getattr(plant, name)
@@ -279,7 +280,7 @@ class Episodes:
         if len(self.sent) > 1:
             self.sent = np.concatenate([command[None], self.sent[:-1]])
             arriving = self.sent[self.delay, np.arange(len(self.delay))]
-        if self._inexact.any():
+        if self._inexact:
             gain, offset, backlash = self._drives.values()
             arriving = play(gain * arriving + offset, self.backend.command, backlash)
         if self.task.load is not None:
@@ -360,6 +361,8 @@ class Episodes:
             None if velocity is None else velocity[only],
             None if task.sensors is None else self._sensor_values(squash(shown.sensors), index),
         )
+        if self._alone:
+            return observation, reward if state.converged else np.float64(0.0), info
         return observation, np.where(state.converged, reward, 0.0), info
 
     def _present(self, states: Sequence[State]) -> BatchState:

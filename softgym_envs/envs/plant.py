@@ -166,7 +166,7 @@ class Plants:
         return Plant(**values)
 
 
-@dataclass(frozen=True)
+@dataclass(slots=True)
 class Sensed:
     """What the sensors of a robot show.
 
