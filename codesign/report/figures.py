@@ -99,7 +99,6 @@ class _Shown:
         self.names = [self._name(variable) for variable in self.variables]
         self.roles = results.roles
         self.trials = {trial.number: trial for trial in snapshot.trials}
-        self.study = self._study()
 
     @staticmethod
     def _name(variable: DesignVariable) -> str:
@@ -120,13 +119,14 @@ class _Shown:
         """Return the objectives of a trial."""
         return [trial.values[objective.name] * objective.scale for objective in self.objectives]
 
-    def _study(self) -> optuna.Study:
+    def study(self, count: int) -> optuna.Study:
+        """Return an Optuna study of the first objectives; of one, Optuna knows which trials are the best so far."""
         import optuna
         from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution
         from optuna.trial import TrialState
 
         optuna.logging.set_verbosity(optuna.logging.WARNING)
-        study = optuna.create_study(directions=[objective.direction for objective in self.objectives])
+        study = optuna.create_study(directions=[objective.direction for objective in self.objectives[:count]])
         space: dict[str, BaseDistribution] = {}
         for name, variable in zip(self.names, self.variables, strict=True):
             factor = display(variable.unit).factor
@@ -142,7 +142,7 @@ class _Shown:
                 continue
             limits = {} if trial.feasible else trial.violations
             shown = optuna.create_trial(
-                params=self.params(trial), distributions=space, values=self.values(trial), constraints=limits
+                params=self.params(trial), distributions=space, values=self.values(trial)[:count], constraints=limits
             )
             study.add_trial(shown)
         return study
@@ -173,17 +173,15 @@ def _of_trials(snapshot: StudySnapshot, results: StudyResults) -> Iterator[tuple
     from optuna import visualization
 
     shown = _Shown(snapshot, results)
-    first, several = shown.objectives[0], len(shown.objectives) > 1
-    target = (lambda trial: trial.values[0]) if several else None
-    named: dict[str, Any] = {"target": target, "target_name": first.axis}
-    with warnings.catch_warnings():  # it says that a target of ours may be maximised
+    study, named = shown.study(1), {"target_name": shown.objectives[0].axis}
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
-        history = styled(visualization.plot_optimization_history(shown.study, **named), 360)
+        history = styled(visualization.plot_optimization_history(study, **named), 360)
         shown.mark(history, lambda trial: trial.number, lambda trial: shown.values(trial)[0])
         yield "Every trial, and the best so far", history
         for start in range(0, len(shown.names), WIDE):
             part = shown.names[start : start + WIDE]
-            figure = styled(visualization.plot_slice(shown.study, part, **named), 340)
+            figure = styled(visualization.plot_slice(study, part, **named), 340)
             for column, name in enumerate(sorted(part), start=1):  # as Optuna does
                 place = {} if len(part) == 1 else {"row": 1, "col": column}
                 shown.mark(
@@ -194,15 +192,15 @@ def _of_trials(snapshot: StudySnapshot, results: StudyResults) -> Iterator[tuple
                     **place,
                 )
             yield "The objective along each variable", figure
-        if several:
+        if len(shown.objectives) > 1:
             labels = [objective.axis for objective in shown.objectives]
             front = visualization.plot_pareto_front(
-                shown.study, target_names=labels[:2], targets=lambda trial: trial.values[:2]
+                shown.study(2), target_names=labels[:2], targets=lambda trial: trial.values[:2]
             )
             shown.mark(front, lambda trial: shown.values(trial)[0], lambda trial: shown.values(trial)[1])
             yield "Several objectives", styled(front, 400)
         if len(shown.names) > 1:
-            lines = styled(visualization.plot_parallel_coordinate(shown.study, shown.names, **named), 380)
+            lines = styled(visualization.plot_parallel_coordinate(study, shown.names, **named), 380)
             yield "Bodies and their objective", lines.update_layout(margin={"l": 90, "r": 70, "t": 70, "b": 30})
 
 

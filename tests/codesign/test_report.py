@@ -120,6 +120,22 @@ def test_a_typical_goal_is_one_that_the_baseline_misses(tested):
     assert typical_goal(snapshot, collect(snapshot)) == 3
 
 
+@pytest.mark.parametrize("secondary", [[], ["material_volume"]])
+def test_the_history_follows_the_direction_of_the_first_objective(study, secondary):
+    folder = study(objective="success_rate", secondary_objectives=secondary, finalists={"count": 0})
+    (folder.path / "trials").mkdir(exist_ok=True)
+    for number, rate in enumerate([0.5, 0.25, 0.75, 0.5]):
+        write_trial(folder, number, 1e-3, (0.1 * number, 0.5))
+        path = folder.trial(number) / "result.json"
+        values = {"success_rate": rate, "mean_distance": 1e-3, "material_volume": 2e-5 - 1e-6 * number}
+        replace(TrialResult.read(path), values=values, scores=[rate, -2e-5][: 1 + len(secondary)]).write(path)
+    snapshot = load_study(folder)
+    figures = dict(search_figures(snapshot, collect(snapshot)))
+    history = {trace.name: list(trace.y) for trace in figures["Every trial, and the best so far"].data}
+    assert history["Best Value"] == [50.0, 50.0, 75.0, 75.0]
+    assert ("Several objectives" in figures) == bool(secondary)
+
+
 def test_outcomes_of_goals(tested):
     snapshot = tested([1e-3, 1e-3, 4e-3, 4e-3, 4e-3, 1e-3], FAR)  # the baseline reaches the second goal only
     outcomes = goal_outcomes(snapshot, collect(snapshot))
