@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from softgym_envs.agents.evaluation import make_agent
 from softgym_envs.backends.backend import State
+from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.phases.ends import episode_commands
 from softgym_envs.codesign.phases.finalists import finalist_environment, policy_file
 from softgym_envs.codesign.records import Finalist
 from softgym_envs.codesign.report.results import StudyResults
 from softgym_envs.codesign.snapshot import StudySnapshot
 from softgym_envs.envs.tasks.base import Task
+from softgym_envs.executors import parallel_map
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Robot
 from softgym_envs.units import display
@@ -96,7 +99,9 @@ def run_episodes(snapshot: StudySnapshot, results: StudyResults) -> list[Episode
     bodies = {
         body.trial: (role, body) for role, body in (("baseline", results.baseline), ("winner", results.winner)) if body
     }
-    return [_run(snapshot, role, body, path) for role, body in bodies.values()]
+    jobs = [(snapshot.config, role, body, policy_file(snapshot, body), path) for role, body in bodies.values()]
+    found = {episode.role: episode for episode in parallel_map(_run, jobs, snapshot.config.workers)}
+    return [found[role] for role, _ in bodies.values()]
 
 
 def moments(commands: np.ndarray) -> list[int]:
@@ -112,15 +117,14 @@ def moments(commands: np.ndarray) -> list[int]:
     return list(dict.fromkeys([*found[:-1].tolist(), len(commands) - 1]))
 
 
-def _run(snapshot: StudySnapshot, role: str, body: Finalist, path: np.ndarray) -> Episode:
-    environment = finalist_environment(snapshot.config, "fem", body.options)
-    policy = policy_file(snapshot, body)
+def _run(config: StudyConfig, role: str, body: Finalist, policy: Path | None, path: np.ndarray) -> Episode:
+    environment = finalist_environment(config, "fem", body.options)
     if policy is None:  # the QP alone, not on top of another one
         environment = environment.model_copy(update={"residual_scale": 0.0})
     controller = "qp" if policy is None else policy
     commands = None
-    if snapshot.config.finalists.test == "ends":
-        start = finalist_environment(snapshot.config, "surrogate", body.options)
+    if config.finalists.test == "ends":
+        start = finalist_environment(config, "surrogate", body.options)
         commands = episode_commands(controller, start, path, body.design)[0]
     agent, env = make_agent(controller), environment.make(sample_design=False)
     inner: Any = env.unwrapped

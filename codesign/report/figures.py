@@ -173,7 +173,8 @@ def _of_trials(snapshot: StudySnapshot, results: StudyResults) -> Iterator[tuple
     from optuna import visualization
 
     shown = _Shown(snapshot, results)
-    study, named = shown.study(1), {"target_name": shown.objectives[0].axis}
+    study = shown.study(1)
+    named: dict[str, Any] = {"target_name": shown.objectives[0].axis}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         history = styled(visualization.plot_optimization_history(study, **named), 360)
