@@ -27,14 +27,13 @@ class FinRay(GmshRobot):
 
     def draw(self, design):
         """Cut the cells between the ribs out of a prism, 16 mm deep."""
-        base, wall, rib = design["base"], design["wall"], design["rib"]
+        base, wall, rib = (design[name] for name in ("base", "wall", "rib"))
         thick = wall * np.hypot(base, 0.09) / 0.09  # the back wall, measured along x
-        prism = self.prism([(0, 0), (base, 0), (0.004, 0.09), (0, 0.09)])
-        ends = np.linspace(0.004, 0.074, 6)
-        cells = [(ends[k] + 0.5 * rib, ends[k + 1] - 0.5 * rib) for k in range(5)]
+        cells = [(y + 0.5 * rib, y + 0.014 - 0.5 * rib) for y in 0.004 + 0.014 * np.arange(5)]
         back = [[base - (base - 0.004) * y / 0.09 - thick for y in ab] for ab in cells]
-        holes = [self.prism([(wall, a), (c, a), (d, b), (wall, b)]) for (a, b), (c, d) in zip(cells, back, strict=True)]
-        gmsh.model.occ.cut([prism], holes)
+        quads = [[(wall, a), (c, a), (d, b), (wall, b)] for (a, b), (c, d) in zip(cells, back, strict=True)]
+        body = self.prism([(0, 0), (base, 0), (0.004, 0.09), (0, 0.09)])
+        gmsh.model.occ.cut([body], [self.prism(quad) for quad in quads])
         self.name_faces("fixed", y=0.0)
 
     def prism(self, corners, depth=0.016):

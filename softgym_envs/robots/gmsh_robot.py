@@ -197,7 +197,7 @@ class GmshRobot(Robot):
         It is empty for code that is in no file, such as that of a notebook, whose meshes are not kept.
         """
         modules = {base.__module__ for base in type(self).__mro__ if issubclass(base, GmshRobot)} - {__name__}
-        files = [getattr(sys.modules[name], "__file__", None) for name in sorted(modules)]
+        files = [getattr(sys.modules.get(name), "__file__", None) for name in sorted(modules)]
         if not all(files):
             return ""
         code = [ast.unparse(ast.parse(Path(str(file)).read_text(encoding="utf-8"))) for file in files]

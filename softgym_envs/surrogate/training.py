@@ -304,12 +304,13 @@ def account(robot: Robot, card: Mapping[str, Any]) -> list[str]:
     found = card.get("trusted")
     if found is None:
         return lines
-    for actuator, largest, typical in zip(robot.actuators, found["effort"], robot.effort_scale, strict=True):
-        if largest > 10.0 * typical:
-            lines.append(
-                f"'{actuator.name}' needs up to {largest:.3g} {effort_unit(actuator.unit)}, {largest / typical:.0f} "
-                "times its effort_scale: do actuators fight each other? (`Robot.antagonists`, `softgym check`)"
-            )
+    shares = np.array(found["effort"]) / robot.effort_scale
+    if (most := float(shares.max())) > 10.0:
+        actuator, largest = robot.actuators[int(shares.argmax())], found["effort"][int(shares.argmax())]
+        lines.append(
+            f"'{actuator.name}' needs up to {largest:.3g} {effort_unit(actuator.unit)}, {most:.0f} times its "
+            "effort_scale: do actuators fight each other? (`Robot.antagonists`, `softgym check`)"
+        )
     tested = counted(int(card["test"]["states"]), "test state")
     text = f"It can be trusted on {found['share']:.0%} of {tested} of new bodies"
     if found["effector_p95"] is not None:

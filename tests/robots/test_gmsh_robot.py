@@ -11,6 +11,7 @@ import pytest
 from softgym_envs import DesignSpace, DesignVariable
 from softgym_envs.errors import InfeasibleDesign, MeshingError
 from softgym_envs.extensions.deployment.cad import export_body
+from softgym_envs.extensions.deployment.moulds import export_moulds
 from softgym_envs.mechanics import Statics
 from softgym_envs.robots import Actuator, GmshRobot
 from softgym_envs.robots.geometry.morphing import mean_ratio
@@ -63,6 +64,19 @@ def cache(tmp_path, monkeypatch):
 def volume(mesh):
     corners = mesh.nodes[mesh.tetrahedra]
     return float(np.linalg.det(corners[:, 1:] - corners[:, :1]).sum()) / 6.0
+
+
+def step_volume(path):
+    """Volume of the one solid in a STEP file [mm3]."""
+    gmsh.initialize(interruptible=False)
+    try:
+        gmsh.option.setNumber("General.Terminal", 0)
+        gmsh.model.occ.importShapes(str(path))
+        gmsh.model.occ.synchronize()
+        ((_, body),) = gmsh.model.getEntities(3)
+        return gmsh.model.occ.getMass(3, body)
+    finally:
+        gmsh.finalize()
 
 
 def test_one_mesh_follows_all_designs_with_the_same_faces():
@@ -124,16 +138,16 @@ def test_options_and_code_are_part_of_what_is_kept(cache, monkeypatch):
 def test_the_step_file_is_the_exact_shape_in_millimetres(tmp_path):
     path = export_body(Bellows(), tmp_path / "body.step", {"height": 0.05})
     assert re.search(r"SI_UNIT\(\.MILLI\.,\.METRE\.\)", path.read_text())
-    gmsh.initialize(interruptible=False)
-    try:
-        gmsh.option.setNumber("General.Terminal", 0)
-        gmsh.model.occ.importShapes(str(path))
-        gmsh.model.occ.synchronize()
-        ((_, body),) = gmsh.model.getEntities(3)
-        exact = 20.0**2 * 50.0 - np.pi * 6.0**2 * 40.0
-        assert gmsh.model.occ.getMass(3, body) == pytest.approx(exact, rel=1e-6)
-    finally:
-        gmsh.finalize()
+    assert step_volume(path) == pytest.approx(20.0**2 * 50.0 - np.pi * 6.0**2 * 40.0, rel=1e-6)
+
+
+def test_a_mould_is_a_block_less_the_body_and_the_cores_of_its_chambers(tmp_path):
+    """Open where the body is clamped, at z = 0; walls of 3 mm elsewhere."""
+    files = export_moulds(Bellows(), tmp_path, {"height": 0.05}, formats=(".step",))
+    assert [file.stem for file in files] == ["low", "high", "core_chamber"]
+    half = 0.5 * (26.0**2 * 53.0 - 20.0**2 * 50.0)
+    for file, exact in zip(files, (half, half, np.pi * 6.0**2 * 40.0), strict=True):
+        assert step_volume(file) == pytest.approx(exact, rel=1e-4)  # gmsh's boxes are larger by 1e-7 m
 
 
 def test_impossible_shapes():

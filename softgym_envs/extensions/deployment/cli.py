@@ -136,7 +136,7 @@ def deploy_policy(policy: str, files: tuple[Path, ...], name: str) -> None:
 @click.argument("files", nargs=-1, type=options.PATH)
 @options.robot_option
 @options.design
-@click.option("--moulds", type=options.PATH, help="Write the parts of a finger's mould to this folder.")
+@click.option("--moulds", type=options.PATH, help="Write the parts of the body's mould to this folder.")
 @click.option("--joints", default=9, show_default=True, help="Joints of the chain in an .xml file.")
 def export(
     robot: str,

@@ -1,6 +1,11 @@
-"""Casting moulds of the fingers, derived from the design (thesis, sec. 3.2.3 and 3.3.2).
+"""Casting moulds, derived from the design: of any body that gmsh draws, and those of the fingers.
 
-A finger is cast upside down: its flat bottom (y = 0) is the open face of the mould.
+Any body is cast in two halves of a block, ``low`` and ``high``, which meet in the middle of its thinnest side and are
+open where it is clamped. Each chamber is a part ``core_NAME``, of wax or another material that is melted or washed out,
+and is held in its place by wires.
+
+The moulds of fingers are those of the thesis (sec. 3.2.3 and 3.3.2). They are cast upside down: their flat bottom
+(y = 0) is the open face of the mould.
 
 * ``box``: a block with the outer shape of the finger cut out, and bores for wires that keep the cable channels free.
 * ``lid``: closes the bottom. It carries the cores of the cavities, overlaps the rim of the box, and has a window over
@@ -15,11 +20,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
+from softgym_envs.errors import InfeasibleDesign
 from softgym_envs.extensions.deployment.cad import FORMATS, write_drawing
 from softgym_envs.extensions.sensing.sensorized_finger import SensorizedFinger
 from softgym_envs.robots.base import Drawing, Robot
 from softgym_envs.robots.geometry.finger_shape import FLANGE, THICKNESS, draw_finger
+from softgym_envs.robots.gmsh_robot import FIXED, GmshRobot
 from softgym_envs.robots.soft_finger import SoftFinger
 
 MOULD_PARTS = ("box", "lid", "cork", "clamp")
@@ -34,10 +42,10 @@ SCREW_RADIUS = 1.7  # M3
 
 
 def mould_parts(robot: Robot, design: Mapping[str, float] | None = None) -> dict[str, Drawing]:
-    """Return the drawings of the parts of a finger's mould.
+    """Return the drawings of the parts of a body's mould.
 
     Args:
-        robot: a `SoftFinger` or a `SensorizedFinger`.
+        robot: a `SoftFinger`, a `SensorizedFinger`, or a `GmshRobot` that draws its body.
         design: the body; missing variables take their baseline.
 
     Returns:
@@ -45,16 +53,24 @@ def mould_parts(robot: Robot, design: Mapping[str, float] | None = None) -> dict
 
     Raises:
         DesignError: for a malformed design.
-        InfeasibleDesign: if the finger cannot exist.
+        InfeasibleDesign: if the body cannot exist.
         ValueError: for another robot.
     """
     complete = robot.design_space.complete(design)
+    if isinstance(robot, GmshRobot) and type(robot).draw is not GmshRobot.draw:
+        body = robot.drawing(complete)
+        chambers = [actuator.name for actuator in robot.actuators if actuator.unit == "m3"]
+        parts = ["low", "high", *(f"core_{name}" for name in chambers)]
+        return {part: (draw_cast, {"body": body, "part": part}) for part in parts}
     if isinstance(robot, SensorizedFinger):
         wires = [[0.0, 1e3 * robot.cable_height(complete)]]
     elif isinstance(robot, SoftFinger):
         wires = [[1e3 * x, 1e3 * robot.cable_height] for x in robot.cable_offsets]
     else:
-        raise ValueError(f"robot '{robot.name}' has no moulds; allowed: finger, sensorized_finger")
+        raise ValueError(
+            f"robot '{robot.name}' has no moulds; allowed: robots that draw their body (GmshRobot), finger, "
+            "sensorized_finger"
+        )
     robot.drawing(complete)  # raises if the finger cannot exist
     lengths = {"split": 0.0, **robot.lengths(complete)}
     return {
@@ -73,10 +89,10 @@ def export_moulds(
     formats: Sequence[str] = FORMATS,
     time_limit: float = 120.0,
 ) -> list[Path]:
-    """Write all parts of a finger's mould into a folder, in millimetres.
+    """Write all parts of a body's mould into a folder, in millimetres.
 
     Args:
-        robot: a `SoftFinger` or a `SensorizedFinger`.
+        robot: a `SoftFinger`, a `SensorizedFinger`, or a `GmshRobot` that draws its body.
         folder: output folder, which is created if necessary.
         design: the body; missing variables take their baseline.
         formats: file endings, from ``.step`` and ``.stl``.
@@ -87,7 +103,7 @@ def export_moulds(
 
     Raises:
         DesignError: for a malformed design.
-        InfeasibleDesign: if the finger cannot exist or a part cannot be drawn.
+        InfeasibleDesign: if the body cannot exist or a part cannot be drawn.
         ValueError: for another robot or format.
     """
     return [
@@ -95,6 +111,62 @@ def export_moulds(
         for name, drawing in mould_parts(robot, design).items()
         for ending in formats
     ]
+
+
+def draw_cast(body: Drawing, part: str) -> None:
+    """Draw a part of the mould of any body with gmsh, in the unit of its own drawing.
+
+    Args:
+        body: drawing of the body.
+        part: ``"low"`` or ``"high"``, half of a block without the body, or ``"core_NAME"``, the chamber of an actuator.
+    """
+    import gmsh
+    import numpy as np
+
+    occ = gmsh.model.occ
+    function, parameters = body
+    function(**parameters)
+    occ.synchronize()
+    ((_, volume),) = gmsh.model.getEntities(3)
+    tags = [tag for _, tag in gmsh.model.getPhysicalGroups(2)]
+    groups = {gmsh.model.getPhysicalName(2, tag): gmsh.model.getEntitiesForPhysicalGroup(2, tag) for tag in tags}
+    bounds = np.array(gmsh.model.getBoundingBox(3, volume)).reshape(2, 3)
+    clamped = [np.array(gmsh.model.getBoundingBox(2, face)).reshape(2, 3) for face in groups.get(FIXED, ())]
+    loops, surfaces = occ.getSurfaceLoops(volume)
+    if part.startswith("core_"):
+        name = part.removeprefix("core_")
+        if name not in groups:
+            raise InfeasibleDesign(f"the drawing names no faces '{name}', so its chamber has no core")
+        chosen = [loop for loop, found in zip(loops, surfaces, strict=True) if groups[name][0] in found]
+    else:
+        chosen = [max(zip(loops, surfaces, strict=True), key=lambda pair: _diagonal(gmsh, pair[1]))[0]]
+    solid = occ.addVolume(chosen)
+    occ.remove([(3, volume)])
+    gmsh.model.removePhysicalGroups()
+    if part.startswith("core_"):
+        return
+    wall = WALL * (1e-3 if gmsh.option.getString("Geometry.OCCTargetUnit") == "M" else 1.0)
+    slack = 1e-3 * wall
+    low, high = bounds[0] - wall, bounds[1] + wall
+    for box in clamped:  # open where the body is clamped, if that is an end of it
+        for axis in range(3):
+            if box[1, axis] - box[0, axis] < slack:
+                if abs(box[0, axis] - bounds[0, axis]) < slack:
+                    low[axis] = box[0, axis]
+                elif abs(box[1, axis] - bounds[1, axis]) < slack:
+                    high[axis] = box[1, axis]
+    thin = int(np.argmin(bounds[1] - bounds[0]))
+    middle = 0.5 * (bounds[0, thin] + bounds[1, thin])
+    (high if part == "low" else low)[thin] = middle
+    occ.cut([(3, occ.addBox(*low, *(high - low)))], [(3, solid)])
+
+
+def _diagonal(gmsh: Any, faces: Sequence[int]) -> float:
+    """Return the size of the box around faces, in the unit of the drawing."""
+    import numpy as np
+
+    boxes = np.array([gmsh.model.getBoundingBox(2, face) for face in faces])
+    return float(np.linalg.norm(boxes[:, 3:].max(axis=0) - boxes[:, :3].min(axis=0)))
 
 
 # -- drawings ----------------------------------------------------------------------------------------------------------

@@ -197,7 +197,7 @@ def test_mould_files_are_closed(tmp_path, occ):
 
 
 def test_moulds_need_a_feasible_finger(tmp_path):
-    with pytest.raises(ValueError, match="robot 'trunk' has no moulds; allowed: finger, sensorized_finger"):
+    with pytest.raises(ValueError, match="robot 'trunk' has no moulds; allowed: robots that draw"):
         mould_parts(make_robot("trunk"))
     with pytest.raises(InfeasibleDesign, match="the notches meet"):
         export_moulds(make_robot("sensorized_finger"), tmp_path / "moulds", {"slope": 1.04})
