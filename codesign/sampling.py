@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from softgym_envs.config import Config
-from softgym_envs.registry import Table
+from softgym_envs.registry import Table, import_place, is_place
 
 if TYPE_CHECKING:
     import optuna
@@ -31,7 +31,7 @@ SAMPLERS = Table(
 
 
 class SamplerConfig(Config):
-    """Algorithm that proposes designs: a key of `SAMPLERS`, its seed (`trial_seed`) and further arguments."""
+    """Algorithm that proposes designs: a key of `SAMPLERS` or ``module:Class``, its seed and further arguments."""
 
     name: str = "tpe"
     seed: int = Field(default=0, ge=0)
@@ -39,7 +39,7 @@ class SamplerConfig(Config):
 
     @model_validator(mode="after")
     def _known_options(self) -> SamplerConfig:
-        check_options("sampler", self.name, SAMPLERS.find(self.name), self.options)
+        check_options("sampler", self.name, find_class("sampler", self.name, SAMPLERS), self.options)
         return self
 
 
@@ -56,7 +56,24 @@ def trial_seed(config: SamplerConfig, number: int) -> int:
 
 def make_sampler(config: SamplerConfig, number: int) -> optuna.samplers.BaseSampler:
     """Return the sampler for one trial."""
-    return construct(SAMPLERS[config.name], {"seed": trial_seed(config, number), **config.options})
+    cls = find_class("sampler", config.name, SAMPLERS)
+    seed = {"seed": trial_seed(config, number)} if "seed" in inspect.signature(cls).parameters else {}
+    return construct(cls, {**seed, **config.options})
+
+
+def find_class(kind: str, name: str, table: Table) -> type:
+    """Return a sampler or pruner: one of a table, or of yours or OptunaHub's as ``module:Class``.
+
+    Raises:
+        ValueError: for an unknown name, or a place where there is no class.
+    """
+    if not is_place(name):
+        found: type = table.find(name)
+        return found
+    found = import_place(kind, name)
+    if not isinstance(found, type):
+        raise ValueError(f"{kind} '{name}' must be a class, got {found!r}")
+    return found
 
 
 def construct(cls: type, options: dict[str, Any]) -> Any:

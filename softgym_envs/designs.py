@@ -35,8 +35,8 @@ class DesignVariable:
         description: what the variable means to a designer.
         log: whether to sample and normalise on a logarithmic scale.
         choices: names of what the whole part of the value chooses, from 0; the bounds are then 0 and their number, and
-            the upper one chooses the last. A design holds the middle value of its choice. Samplers of studies treat
-            such a variable as categorical, and observations show one number for each choice.
+            the upper one chooses the last. A choice is given by its name or its value; a design holds the middle value.
+            Samplers of studies treat such a variable as categorical, and observations show one number for each choice.
     """
 
     name: str
@@ -78,6 +78,10 @@ class DesignVariable:
         """Return ``value`` as a float inside the bounds, or raise `DesignError`."""
         unit = "" if self.unit == "1" else f" {self.unit}"
         allowed = f"allowed: {self.low:g} to {self.high:g}{unit}"
+        if self.choices and isinstance(value, str):
+            if value not in self.choices:
+                raise DesignError(f"design variable '{self.name}': {unknown_name('choice', value, self.choices)}")
+            return self.choices.index(value) + 0.5
         try:
             if isinstance(value, str | bytes | bool):
                 raise TypeError

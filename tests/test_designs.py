@@ -294,3 +294,12 @@ def test_choices_are_shown_one_by_one_and_kept_at_their_middles():
     assert space.observe(designs, []).shape == (3, 0)
     drawn = {space.sample(np.random.default_rng(seed))["kind"] for seed in range(20)}
     assert drawn == {0.5, 1.5, 2.5}
+
+
+def test_choices_are_given_by_name_or_value():
+    kind = DesignVariable("kind", 0.0, 3.0, 0.5, "1", "module", choices=("leaf", "block", "hinge"))
+    space = DesignSpace(kind)
+    assert space.complete({"kind": "block"})["kind"] == space.complete({"kind": 1.2})["kind"] == 1.5
+    assert kind.choice(space.complete({"kind": "block"})["kind"]) == "block"
+    with pytest.raises(DesignError, match=r"'kind': unknown choice 'blok'; did you mean 'block'\?"):
+        space.complete({"kind": "blok"})

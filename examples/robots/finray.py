@@ -51,4 +51,4 @@ class FinRay(GmshRobot):
 
     def own_obstacles(self, model, design):
         """A rod of 12 mm beside the front wall."""
-        return [Cylinder((-0.0068, 0.045, 0.0), (0.0, 0.0, 1.0), 0.006)]
+        return [Cylinder((-0.0066, 0.065, 0.0), (0.0, 0.0, 1.0), 0.006)]

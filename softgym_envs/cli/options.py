@@ -81,7 +81,10 @@ overrides = click.argument("overrides", nargs=-1, metavar="[KEY=VALUE]...")
 quiet = click.option("--quiet", is_flag=True, help="Hide progress bars.")
 as_json = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 design = click.option(
-    "--design", multiple=True, metavar="NAME=VALUE", help="Design variable in SI units; repeat for several."
+    "--design",
+    multiple=True,
+    metavar="NAME=VALUE",
+    help="Design variable in SI units, or a choice; repeat.",
 )
 robot_option = click.option(
     "--option", "options_", multiple=True, metavar="NAME=VALUE", help="Robot option; repeat for several."
@@ -149,18 +152,14 @@ def complete_robot(ctx: click.Context, param: click.Parameter, incomplete: str) 
     return [name for name in ROBOTS if name.startswith(incomplete)]
 
 
-def design_of(pairs: tuple[str, ...]) -> dict[str, float]:
-    """Return the design variables of ``--design name=value``.
-
-    Raises:
-        ConfigError: if a value is not a number.
-    """
-    values = {}
+def design_of(pairs: tuple[str, ...]) -> dict[str, Any]:
+    """Return the design variables of ``--design name=value``: numbers in SI units, or names of choices."""
+    values: dict[str, Any] = {}
     for name, text in _split("design", pairs):
         try:
             values[name] = float(text)
         except ValueError:
-            raise ConfigError(f"--design {name}={text}: the value must be a number in SI units") from None
+            values[name] = text  # refused with the variable's bounds unless it names a choice
     return values
 
 

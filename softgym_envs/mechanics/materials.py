@@ -58,16 +58,22 @@ class Material(ABC):
             The number of inverted (det F <= 0) or non-finite gradients; the outputs are meaningless if not 0.
         """
 
-    @abstractmethod
     def dilation(self, F: np.ndarray, dilation: np.ndarray, gradient: np.ndarray, hessian: np.ndarray) -> None:
         """Fill the measure of volume change that Lame's first parameter acts on: psi = psi(mu, 0) + lambda / 2 theta^2.
+
+        Only averaged elements need it.
 
         Args:
             F: deformation gradients, shape (m, 9), none inverted.
             dilation: output theta, shape (m,).
             gradient: output d theta / dF, shape (m, 9).
             hessian: output d2 theta / dF2, shape (m, 9, 9).
+
+        Raises:
+            ValueError: if the material does not define it.
         """
+        name = getattr(self, "name", type(self).__name__)
+        raise ValueError(f"material '{name}' defines no dilation, as element 'averaged' needs; allowed: 'quadratic'")
 
 
 @njit(cache=True, inline="always", error_model="numpy")
