@@ -62,7 +62,7 @@ def _photographs(
     """Return the pictures of each body, in every pose."""
     from softgym_envs.viewer.image import ImageRenderer
 
-    renderer = ImageRenderer(robot, IMAGE_SIZE)
+    renderer = ImageRenderer(robot, IMAGE_SIZE, framed=list(bodies.values()))
     try:
         return [
             (role, [_source(renderer.render_body(body, command)) for _, command in poses])

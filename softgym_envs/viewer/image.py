@@ -31,6 +31,7 @@ class ImageRenderer:
         size: width and height [pixels].
         window: show the images in a window too.
         source: finite elements of the robot whose states are rendered: their model is used instead of a new one.
+        framed: other bodies that the camera view contains at rest.
 
     Attributes:
         shapes: finds the shapes that are drawn.
@@ -46,6 +47,7 @@ class ImageRenderer:
         *,
         window: bool = False,
         source: FEMBackend | None = None,
+        framed: Sequence[Mapping[str, float] | None] = (),
     ) -> None:
         if window:
             check_display()
@@ -55,6 +57,7 @@ class ImageRenderer:
         self.robot = robot
         self.size = (width, height)
         self._window = window
+        self._framed = framed
         self.shapes = ShapeFinder(robot, source)
         self._scene: Scene | None = None
 
@@ -135,6 +138,10 @@ class ImageRenderer:
             pulled = [_pulled(line, self.robot.upper[row]) for row, line in lines.items()]
             seen = [BodySurface(model).points(x), *pulled, _reached(self.robot, rest)]
             seen += [points for points, _ in obstacle_skins(model, self.robot.size)]
+            for other in {self.robot.design_space.complete(body) for body in self._framed} - {baseline}:
+                shape, nodes = BodySurface(self.shapes.load(other)), self.shapes.rest(other).nodes
+                assert nodes is not None
+                seen.append(shape.points(nodes))
             self._scene = Scene(self.robot, self.size, np.concatenate(seen), window=self._window)
         return self._scene
 
@@ -185,7 +192,7 @@ def render_bodies(
     ghost: Mapping[str, float] | None = None,
     texts: Sequence[str] | None = None,
 ) -> np.ndarray:
-    """Return images of several bodies side by side with one camera, shape (height, k * width, 3) uint8.
+    """Return images of several bodies with one camera, which sees all of them, shape (height, k * width, 3) uint8.
 
     Args:
         robot: the family of bodies.
@@ -195,7 +202,7 @@ def render_bodies(
         ghost: a body drawn pale behind each body.
         texts: k captions.
     """
-    renderer = ImageRenderer(robot, size)
+    renderer = ImageRenderer(robot, size, framed=designs)
     try:
         captions = [""] * len(designs) if texts is None else texts
         images = [

@@ -274,3 +274,12 @@ class TestRecording:
     def test_foreign_environment_is_refused(self, tmp_path):
         with pytest.raises(ValueError, match="SoftRobotEnv"):
             record_rollout(gymnasium.make("CartPole-v1"), lambda *_: 0, tmp_path / "rollout.rrd")
+
+
+def test_pictures_are_framed_on_the_bodies_that_they_show():
+    """The camera moves back for a body that is longer than the baseline."""
+    robot = make_robot("finger", design_box="wide")
+    alone = render_body(robot, size=(120, 120))
+    both = render_bodies(robot, [None, {"length": 0.052}], size=(120, 120))
+    assert both.shape == (120, 240, 3)
+    assert not np.array_equal(both[:, :120], alone)
