@@ -48,11 +48,13 @@ def _poses(snapshot: StudySnapshot) -> list[tuple[str, np.ndarray | None]]:
     """Return captions and commands (n_a,) of the pictures."""
     robot = snapshot.config.robot
     half = 0.5 * robot.upper
-    poses: list[tuple[str, np.ndarray | None]] = [("at rest", None), ("all actuators at 50 %", half)]
+    poses: list[tuple[str, np.ndarray | None]] = [("at rest", None)]
+    if not robot.antagonists:  # all of these at once would only pull against each other
+        poses.append(("all actuators at 50 %", half))
     if len(half) > 1:
         first = np.zeros_like(half)
         first[0] = half[0]
-        poses.append(("first actuator at 50 %", first))
+        poses.append(("first actuator at 50 %", robot.balanced(first)))
     return poses
 
 
