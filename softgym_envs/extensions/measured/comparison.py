@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -117,6 +117,17 @@ def files_in(folder: Path, pattern: str, source: Source) -> list[Path]:
             f"folder '{folder}' has no {pattern}; copy {source.files} there from {source.folder} of {source.origin}"
         )
     return found
+
+
+def left_out(folder: Path, used: Iterable[Path]) -> list[Line]:
+    """Return a line that names the recordings of a folder (C3D, CSV) that a comparison does not use, if any."""
+    kept = {path.name for path in used}
+    names = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in (".c3d", ".csv"))
+    others = [name for name in names if name not in kept]
+    if not others:
+        return []
+    more = f" and {len(others) - 5} more" if len(others) > 5 else ""
+    return [Line("recordings that are left out", ", ".join(others[:5]) + more, "")]
 
 
 def numbers(values: Any, digits: int = 2) -> str:

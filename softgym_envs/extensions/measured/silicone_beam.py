@@ -28,7 +28,7 @@ GRAVITY = (0.0, 0.0, -9.80709)
 MARKERS = {"top": (0.0, 0.015, 0.030), "left": (0.0, 0.0, 0.024), "right": (0.0, 0.030, 0.006)}
 """Where the three markers of the tip are glued on [m]. They stand off by 6 mm; as the authors do, their motion is
 compared with that of the nearest point of the surface."""
-MESHES = {"coarse": (10, 3, 3), "fine": (16, 5, 5)}
+MESHES = {"coarse": (12, 4, 4), "fine": (16, 5, 5)}
 """Cells along the beam, across and upwards, by name of the mesh; each is six tetrahedra."""
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from softgym_envs.extensions.design.fit_page import Page, Picture, Table, drawn
 from softgym_envs.extensions.design.plots import BASELINE, WINNER
-from softgym_envs.extensions.measured.comparison import SOURCES, Comparison, Line, files_in, numbers
+from softgym_envs.extensions.measured.comparison import SOURCES, Comparison, Line, files_in, left_out, numbers
 from softgym_envs.extensions.measured.recordings import read_c3d, rigid_motion
 from softgym_envs.extensions.measured.silicone_beam import MESHES, SiliconeBeam
 from softgym_envs.mechanics.solvers.statics import Statics
@@ -105,6 +105,7 @@ def compare(folder: Path) -> Comparison:
         axes[0].set_ylabel("z [mm]")
         axes[0].legend()
 
+    lines += left_out(folder, [path for paths in files.values() for path in paths])
     misfit = 1e3 * max(value for group in measured.values() for _, value in group)
     columns = ["element", "mesh", "nodes"]
     columns += [f"vertical, {load:.2f} N [mm]" for load in LOADS.values()]

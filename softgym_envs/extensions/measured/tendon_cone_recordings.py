@@ -16,7 +16,7 @@ from softgym_envs.extensions.design.config import CalibrationConfig
 from softgym_envs.extensions.design.fit_page import Page, Picture, Table, drawn, parameter_table
 from softgym_envs.extensions.design.measurements import Measurements
 from softgym_envs.extensions.design.plots import BASELINE, WINNER
-from softgym_envs.extensions.measured.comparison import SOURCES, Comparison, Line, files_in
+from softgym_envs.extensions.measured.comparison import SOURCES, Comparison, Line, files_in, left_out
 from softgym_envs.extensions.measured.recordings import matched, read_marker_table
 from softgym_envs.extensions.measured.tendon_cone import DRUM, MARKERS, TendonCone
 from softgym_envs.mechanics.solvers.statics import Statics
@@ -119,6 +119,7 @@ def compare(folder: Path) -> Comparison:
         *([Line("  held-out recordings", f"{mean['held out']:.1f} mm", "")] if held_out else []),
         Line("  held out, with modulus and density alone", f"{single_error:.1f} mm", "two numbers fitted"),
         Line("identification", f"{seconds:.1f} CPU s", ""),
+        *left_out(folder, [Path(f"{name}.csv") for name in data.trials]),
     ]
     rows = [
         [

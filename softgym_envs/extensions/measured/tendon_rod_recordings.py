@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.config import check_config
+from softgym_envs.envs.plant import play
 from softgym_envs.extensions.design.calibration import calibrate, fitted_units, predicted
 from softgym_envs.extensions.design.config import CalibrationConfig
 from softgym_envs.extensions.design.fit_page import Page, Picture, Table, drawn, parameter_table, residual_picture
 from softgym_envs.extensions.design.measurements import Measurements
 from softgym_envs.extensions.design.plots import BASELINE, WINNER
-from softgym_envs.extensions.measured.comparison import SOURCES, Comparison, Line, files_in
+from softgym_envs.extensions.measured.comparison import SOURCES, Comparison, Line, files_in, left_out
 from softgym_envs.extensions.measured.recordings import read_table
 
 SERVOS = (1, 20, 23, 9, 6, 11, 24, 2, 3)
@@ -24,6 +25,10 @@ SINGLE = "tendon"
 """Part of the label of poses in which one tendon is pulled while the others hang 10 mm slack."""
 STILL = 3e-4
 """Largest pull of a pose at rest [m]."""
+PARTS = 9
+"""Parts of the poses at rest, of which each is predicted from the others."""
+PLAYS = (1e-3, 2e-3, 4e-3)
+"""Widths of play with which friction is looked for [m]."""
 CONFIG: dict[str, Any] = {
     "name": "tendon_rod",
     "robot": "tendon_rod",
@@ -126,8 +131,9 @@ def compare(folder: Path) -> Comparison:
         Line("identification", f"{seconds:.0f} CPU s", ""),
         Line("speed", f"{pace:.1f} CPU s for 1,000 poses", ""),
     ]
+    lines += left_out(folder, [*files_in(folder, "*train.csv", source)[:1], *files[:1]])
     still = np.abs(centred_pulls(train)).max(axis=1) < STILL
-    spread = rmse(train.effector[still]) if still.sum() > 2 else np.nan
+    explained = scatter_at_rest(train) if still.sum() > 3 * PARTS else {}
     rows = []
     for kind, part in parts.items():
         away = 1e3 * np.linalg.norm(error[kind], axis=1)
@@ -147,11 +153,14 @@ def compare(folder: Path) -> Comparison:
             away = 1e3 * np.linalg.norm(error["held out"][mask], axis=1)
             texts = [f"{rmse(error['held out'][mask], aligned=False):.1f}", f"{np.median(away):.1f}"]
             rows.append([f"  held out, {group}", f"{mask.sum()}", *texts, f"{np.percentile(away, 95):.1f}"])
-    rest = (
-        f"What is left: {int(still.sum())} poses with all pulls within {1e3 * STILL:g} mm of their mean lie "
-        f"{spread:.1f} mm (RMS) about their own mean. No function of the present pulls explains this scatter. "
-        "Poses with one tendon pulled against slack ones, outside of the fit, are worst."
-    )
+    rest = "Poses with one tendon pulled against slack ones, outside of the fit, are worst."
+    if explained:
+        rest = (
+            f"What is left: {int(still.sum())} poses with all pulls within {1e3 * STILL:g} mm of their mean lie about "
+            f"their own mean, in mm (RMS, predicted from other poses): "
+            + ", ".join(f"{value:.1f} {name}" for name, value in explained.items())
+            + f". Friction that holds the tendons back would be explained by the last ones. {rest}"
+        )
 
     def draw(axes: list[Any]) -> None:
         computed = found["held out"][:, 9:]
@@ -193,3 +202,31 @@ def centred_pulls(data: Measurements) -> np.ndarray:
     """Return the pulls [m] (N, 9) less the mean pull of their segment."""
     pulls = data.displacement.reshape(-1, 3, 3)
     return (pulls - pulls.mean(axis=2, keepdims=True)).reshape(-1, 9)
+
+
+def scatter_at_rest(data: Measurements) -> dict[str, float]:
+    """Return how far poses at rest lie from where linear functions predict them [mm], by what these know.
+
+    Each of `PARTS` parts of the poses is predicted from the others. Tendons that friction holds back lag behind: a play
+    as wide as the friction stretches them follows the pulls in the order in which they were recorded.
+    """
+    pulls = centred_pulls(data).reshape(-1, 3, 3)
+    across = (pulls @ np.array([[1.0, 0.0], [-0.5, 0.75**0.5], [-0.5, -(0.75**0.5)]])).reshape(-1, 6)
+    still = np.abs(pulls).max(axis=(1, 2)) < STILL
+    tips = data.effector[still]
+
+    def left(known: np.ndarray) -> float:
+        error, columns = np.zeros_like(tips), np.column_stack([np.ones(len(tips)), known])
+        for part in range(PARTS):
+            out = np.arange(len(tips)) % PARTS == part
+            error[out] = tips[out] - columns[out] @ np.linalg.lstsq(columns[~out], tips[~out], rcond=None)[0]
+        return rmse(error, aligned=False)
+
+    found = {"in themselves": left(np.empty((len(tips), 0))), "knowing the present pulls": left(across[still])}
+    for width in PLAYS:
+        behind, lag = across[0], np.empty_like(across)
+        for k, now in enumerate(across):
+            behind = play(now, behind, np.full(6, width))
+            lag[k] = now - behind
+        found[f"and a play of {1e3 * width:g} mm"] = left(np.hstack([across, lag])[still])
+    return found

@@ -9,6 +9,8 @@ import pytest
 
 from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
+from softgym_envs.envs.plant import play
+from softgym_envs.extensions.design.measurements import Measurements
 from softgym_envs.extensions.measured import silicone_beam_recordings, tendon_cone_recordings, tendon_rod_recordings
 from softgym_envs.extensions.measured.comparison import SOURCES
 from softgym_envs.extensions.measured.silicone_beam import LENGTH, MESHES, SiliconeBeam, box_of_tetrahedra
@@ -89,11 +91,13 @@ def test_a_cone_of_known_material(tmp_path, monkeypatch, softgym):
         with open(tmp_path / f"{name}.csv", "w", newline="") as stream:
             rows = [[k, 0.005 * k, *(points + rng.normal(0.0, 2e-4, (5, 3))).ravel()] for k in range(20)]
             csv.writer(stream).writerows(rows)
+    (tmp_path / "m12_u01.csv").write_text("0,0\n")  # both tendons pulled: how much each is not in its name
     data = tendon_cone_recordings.read(tmp_path)
     assert data.trials == tuple(sorted(names))
     found = tendon_cone_recordings.compare(tmp_path)
     mean, held_out = (float(line.ours.removesuffix(" mm")) for line in found.lines[:2])
     assert mean < 0.3 and held_out < 0.3
+    assert [line.ours for line in found.lines if "left out" in line.what] == ["m12_u01.csv"]
     (modulus,) = [text for text in found.fitted if text.startswith("young_modulus")]
     low, high = (float(text) for text in modulus.split()[2:5:2])
     assert 415.0 < low < high < 425.0
@@ -145,3 +149,21 @@ def test_a_rod_of_known_tendons(tmp_path, held_out_file):
     assert outside <= 2
     if held_out_file:
         assert "made_val.csv" in found.lines[0].what
+
+
+@pytest.mark.parametrize("width", [0.0, 2e-3])
+def test_friction_is_seen_in_poses_at_rest(rng, width):
+    """Tips that follow the pulls, and tips that lag behind by a play, as friction would make them."""
+    pulls = 1e-3 * np.cumsum(rng.normal(0.0, 0.7, (900, 3, 3)), axis=0)
+    pulls[::6] = 1e-4 * rng.uniform(-1.0, 1.0, (150, 3, 3))
+    pulls -= pulls.mean(axis=2, keepdims=True)
+    bending = (pulls @ np.array([[1.0, 0.0], [-0.5, 0.75**0.5], [-0.5, -(0.75**0.5)]])).reshape(-1, 6)
+    behind, tips = bending[0], []
+    for now in bending:
+        behind = play(now, behind, np.full(6, width))
+        tips.append([3.0 * behind[0] - behind[1], 2.0 * behind[3], behind[5]])
+    seen = pulls.reshape(-1, 9)
+    data = Measurements("displacement", seen, np.full_like(seen, np.nan), np.array(tips), ("",) * len(seen))
+    found = tendon_rod_recordings.scatter_at_rest(data)
+    assert found["and a play of 2 mm"] < 1e-9
+    assert found["knowing the present pulls"] > 0.3 if width else found["knowing the present pulls"] < 1e-9
