@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -95,7 +96,7 @@ def memory_layers(tensors: Mapping[str, np.ndarray]) -> tuple[Layer, Layer]:
 
 
 class Policy:
-    """Policy that takes the mean action of a trained actor, which may have a memory.
+    """Policy that takes the mean action of a trained actor, which may have a memory or a clock.
 
     Args:
         path: ``policy.safetensors``, with its card next to it, or the name of a shipped policy.
@@ -105,7 +106,8 @@ class Policy:
         card: JSON card of the policy.
         environment: the environment of its training.
         hidden: weights (d, w) and biases (w,) of each hidden layer.
-        memory: weights of a gated recurrent unit in place of hidden layers, see `remember`; None without memory.
+        memory: weights of a gated recurrent unit in place of hidden layers, see `remember`; None without.
+        clock: further biases of the last layer in the steps of a period, shape (p, n_a); None without.
         mean: weights and biases of the last layer.
         observation_size: number of inputs.
 
@@ -142,10 +144,16 @@ class Policy:
                 self.hidden.append((tensors[f"actor.latent_pi.{k}.weight"].T, tensors[f"actor.latent_pi.{k}.bias"]))
                 k += 2  # activations sit between the linear layers
             self.mean = tensors["actor.mu.weight"].T, tensors["actor.mu.bias"]
+            self.clock: np.ndarray | None = tensors.get("actor.clock")
         except KeyError as error:
             raise WeightsError(f"policy '{self.path}' lacks tensor {error}") from None
         first = self.memory[0] if self.memory else self.hidden[0] if self.hidden else self.mean
         self.observation_size = int(first[0].shape[0])
+
+    @property
+    def remembers(self) -> bool:
+        """Whether actions depend on more than the present observation."""
+        return self.memory is not None or self.clock is not None
 
     @property
     def widths(self) -> list[int]:
@@ -175,6 +183,9 @@ class Policy:
 
     def begin(self) -> Callable[[np.ndarray], np.ndarray]:
         """Return a function like `__call__` for one episode, or a batch of episodes that begin together."""
+        if self.clock is not None:
+            biases = itertools.cycle(self.clock)
+            return lambda observation: np.tanh(self._last(observation) + next(biases))
         if self.memory is None:
             return self
         read, recall = self.memory
@@ -192,15 +203,19 @@ class Policy:
         """Return actions (..., n_a) in [-1, 1] for observations (..., d).
 
         Raises:
-            ValueError: for observations of another size than the policy was trained on, and for a policy with a memory,
+            ValueError: for observations of another size than the policy was trained on, and for one that `remembers`,
                 whose actions depend on the episode: use `begin`.
         """
-        if self.memory is not None:
+        if self.remembers:
             raise ValueError(f"policy '{self.path.name}' has a memory: call what begin() returns, in each episode")
+        return np.tanh(self._last(observation))
+
+    def _last(self, observation: np.ndarray) -> np.ndarray:
+        """Return what the last layer makes of observations (..., d), shape (..., n_a)."""
         x = self._checked(observation)
         for weight, bias in self.hidden:
             x = np.maximum(x @ weight + bias, 0.0)
-        return np.tanh(x @ self.mean[0] + self.mean[1])
+        return x @ self.mean[0] + self.mean[1]
 
     def _checked(self, observation: np.ndarray) -> np.ndarray:
         x = np.asarray(observation, dtype=np.float32)

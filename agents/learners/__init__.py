@@ -9,6 +9,7 @@ LEARNERS = Registry(
         "ppo": "softgym_envs.agents.learners.ppo:PPOLearner",
         "analytic": "softgym_envs.agents.learners.analytic:AnalyticLearner",
         "cloning": "softgym_envs.agents.learners.cloning:CloningLearner",
+        "gait": "softgym_envs.agents.learners.gait:GaitLearner",
     },
     base="softgym_envs.agents.learners.base:Learner",
     group="softgym_envs.learners",

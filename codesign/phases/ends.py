@@ -41,7 +41,7 @@ class FinalStates:
 
 def check_policy(policy: str | Path) -> None:
     """Raise ConfigError for a policy whose actions depend on more than the present observation."""
-    if Policy(policy).memory is not None:
+    if Policy(policy).remembers:
         raise ConfigError(
             f"finalists.test = ends needs actions that follow from the last observation, but policy '{policy}' has a "
             "memory; allowed: episodes"

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from softgym_envs.mechanics.contact.contact import ContactMemory
     from softgym_envs.mechanics.solvers.beam_motion import BeamMotion
     from softgym_envs.mechanics.solvers.dynamics import Dynamics, Motion
+    from softgym_envs.mechanics.solvers.rollout import Rollout
 
 
 def _relax_dynamically(model: MechanicalModel, statics: Statics, command: np.ndarray) -> Equilibrium:
@@ -331,6 +332,30 @@ class FEMBackend(Backend):
     def not_compiled(self) -> str | None:
         """Why the general solver computes the present body; None for a body of beams that compiled code can solve."""
         return (self._dynamics or self._statics).not_compiled
+
+    def roll_out(self, commands: np.ndarray) -> Rollout:
+        """Move the present body under commanded displacements without changing the present state.
+
+        Args:
+            commands: one for each control step, shape (k, n_a).
+
+        Returns:
+            The motion, with one entry for each time step, and its gradients; it holds the solver until the next step.
+
+        Raises:
+            ConvergenceError: if a time step cannot be computed.
+            ValueError: without dynamics, or for a body that compiled code cannot solve.
+        """
+        if self._dynamics is None:
+            raise ValueError("roll_out() is that of a motion; make the backend with dynamics=True")
+        from softgym_envs.mechanics.solvers.rollout import roll_out
+
+        kept, start = self._motion, self.state.command
+        try:
+            before = np.vstack([start[None], commands[:-1]])
+            return roll_out(self._dynamics, np.concatenate([*map(self.steps.ramp, before, commands)]))
+        finally:
+            self._go_back(kept)
 
     def go_to(
         self,

@@ -63,7 +63,7 @@ def exported_spaces(policy: Policy) -> AgentSpaces:
         ValueError: for a policy that the exported formats cannot hold: one that has a memory, or that observes sensors
             in place of the effector, or a choice of its body.
     """
-    if policy.memory is not None:
+    if policy.remembers:
         raise ValueError(f"policy '{policy.path}' has a memory and cannot be exported; allowed: policies without")
     env = policy.environment.make()
     env.close()

@@ -1,0 +1,200 @@
+"""Search for a gait along gradients through time (model-based): commands that repeat, without feedback.
+
+The commands of a period follow the gradient of the way that the robot goes, through contact and friction
+(`softgym_envs.mechanics.solvers.rollout`). A gradient costs little more than the motion itself, and the motion is
+short: over a second or two a gradient tells how a gait should change, while those of many periods of a fast gait that
+slips are noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from softgym_envs.agents.config import TrainConfig
+from softgym_envs.agents.learners.base import Learner, Tensors, check_weights
+from softgym_envs.backends.fem import FEMBackend
+from softgym_envs.config import Config
+from softgym_envs.errors import ConvergenceError
+
+TIGHTNESS = 1.0
+"""How fast commands follow those of the gait, in their rates over a distance to them of one rate."""
+FORGET, FORGET_SQUARES = 0.8, 0.95
+"""Memory of the mean and of the mean square of gradients (Kingma and Ba 2015), short for a search of a few steps."""
+
+
+class GaitConfig(Config):
+    """Hyperparameters of the search for a gait (`softgym_envs.agents.learners.gait`)."""
+
+    period: int = Field(default=10, gt=1, description="control steps of a period")
+    periods: int = Field(default=3, gt=1, description="periods of a motion; the way ahead counts after the first one")
+    learning_rate: float = Field(
+        default=0.1, gt=0, description="first step of a command, in half ranges of the actuator"
+    )
+    final_learning_rate: float = Field(default=0.02, gt=0, description="reached linearly at the last step")
+    drift: float = Field(default=1.0, ge=0, description="charge for the way sideways, over the way ahead")
+    spread: float = Field(
+        default=0.05, ge=0, description="by which the seed moves the start away from the reference gait, in half ranges"
+    )
+
+
+class GaitLearner(Learner):
+    """Commands that repeat, improved along the gradient of the way ahead (+x).
+
+    It begins near the reference gait of the robot. A policy adds up a bias that depends on the time in the period and a
+    fixed pull towards it, so it acts as any other policy does, and is limited as these are.
+
+    Args:
+        config: configuration of the training; the environment has one body, and ``num_envs`` has no effect.
+
+    Attributes:
+        gait: commands of a period, -1 and 1 at the ends of the ranges, shape (p, n_a).
+        ways: way ahead of each motion so far after its first period [m].
+
+    Raises:
+        ValueError: for an environment with drawn bodies, or without motion on finite elements in compiled code.
+    """
+
+    Config = GaitConfig
+    title = "gait by gradients"
+    model_based = True
+
+    def __init__(self, config: TrainConfig) -> None:
+        super().__init__(config)
+        environment = config.environment
+        if environment.sample_design or environment.action_mode != "increment" or environment.residual_scale:
+            raise ValueError(
+                "learner 'gait' needs one body, action_mode = increment and no residual_scale, got sample_design = "
+                f"{environment.sample_design}, {environment.action_mode} and {environment.residual_scale:g}"
+            )
+        env: Any = environment.make().unwrapped
+        self.env, backend = env, env.backend
+        if not isinstance(backend, FEMBackend) or not backend.moving or backend.not_compiled is not None:
+            why = backend.not_compiled if isinstance(backend, FEMBackend) else None
+            raise ValueError(f"learner 'gait' needs a motion on finite elements in compiled code: {why or 'no motion'}")
+        self.backend = backend
+        robot = env.robot
+        self._middle, self._half = 0.5 * (robot.lower + robot.upper), 0.5 * (robot.upper - robot.lower)
+        self._gain = TIGHTNESS * self._half / robot.rates
+        gait = robot.reference_gait()
+        places = np.arange(config.settings.period) * len(gait) / config.settings.period
+        after = (np.floor(places).astype(int) + 1) % len(gait)
+        share = (places % 1.0)[:, None]
+        resampled = (1.0 - share) * gait[np.floor(places).astype(int)] + share * gait[after]
+        # What a policy aims at in a step is where it should be after it.
+        noise = np.random.default_rng(config.seed).normal(size=resampled.shape)
+        start = np.roll((resampled - self._middle) / self._half, -1, axis=0)
+        self.gait = np.clip(start + config.settings.spread * noise, -1.0, 1.0)
+        self.step = 0
+        self.ways: list[float] = []
+        self._mean, self._square = np.zeros_like(self.gait), np.zeros_like(self.gait)
+
+    def learn(self, target: int, progress: Callable[[int], object]) -> None:
+        settings = self.config.settings
+        steps = settings.period * settings.periods
+        while self.step < target:
+            try:
+                way, gradient = self.climb()
+            except ConvergenceError:  # a gait that cannot be computed: back to a calmer one
+                self.gait *= 0.8
+            else:
+                self.ways.append(way)
+                self._ascend(gradient, len(self.ways))
+            self.step += steps
+            progress(steps)
+
+    def _ascend(self, gradient: np.ndarray, count: int) -> None:
+        """Make a step of Adam."""
+        settings = self.config.settings
+        self._mean = FORGET * self._mean + (1.0 - FORGET) * gradient
+        self._square = FORGET_SQUARES * self._square + (1.0 - FORGET_SQUARES) * gradient**2
+        size = np.sqrt(self._square / (1.0 - FORGET_SQUARES**count)) + 1e-15
+        share = min(self.step / self.config.steps, 1.0)
+        rate = (1.0 - share) * settings.learning_rate + share * settings.final_learning_rate
+        self.gait = np.clip(self.gait + rate * self._mean / (1.0 - FORGET**count) / size, -1.0, 1.0)
+
+    def climb(self) -> tuple[float, np.ndarray]:
+        """Move the body from rest, and return how the gait should change.
+
+        Returns:
+            Way ahead after the first period [m], and the derivative by the gait of this way less the charge for the way
+            sideways, shape (p, n_a).
+
+        Raises:
+            ConvergenceError: if a time step cannot be computed.
+        """
+        settings, backend, row = self.config.settings, self.backend, self.env.robot.body_frame
+        count, first = settings.period * settings.periods, settings.period
+        commands, follow, pull = self.commands(count)
+        backend.reset()
+        parts = backend.steps.count
+        rollout = backend.roll_out(commands)
+        places = rollout.x[:, row]
+        begin, end = first * parts - 1, count * parts - 1
+        way = places[end] - places[begin]
+        by_way = np.array([1.0, -settings.drift * np.sign(way[1]), 0.0])
+        by_x = np.zeros_like(rollout.x)
+        by_x[end, row], by_x[begin, row] = by_way, -by_way
+        by_part = rollout.gradient(by_x=by_x).commands.reshape(count, parts, -1)
+        # Time steps lie on a ramp from the last command to the next.
+        share = (np.arange(1, parts + 1) / parts)[:, None]
+        by_command = (share * by_part).sum(axis=1)
+        by_command[:-1] += ((1.0 - share) * by_part[1:]).sum(axis=1)
+        gradient, carried = np.zeros_like(self.gait), np.zeros(by_command.shape[1])
+        for k in reversed(range(count)):
+            carried = carried + by_command[k]
+            gradient[k % settings.period] += carried * pull[k]
+            carried = carried * follow[k]
+        return float(way[0]), gradient
+
+    def commands(self, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the commands of the first control steps from rest, as the policy gives them.
+
+        Returns:
+            Commands, their derivatives by the command before, and those by the gait in this step (in half ranges), each
+            of shape (count, n_a).
+        """
+        robot = self.env.robot
+        command, rows = np.zeros(len(self._half)), []
+        for k in range(count):
+            ahead = self.gait[k % len(self.gait)] - (command - self._middle) / self._half
+            action = np.tanh(self._gain * ahead)
+            slope = self._gain * robot.rates * (1.0 - action**2)  # of the command, by what it is ahead
+            wish = command + robot.rates * action
+            free = (wish > robot.lower) & (wish < robot.upper)
+            command = np.clip(wish, robot.lower, robot.upper)
+            rows.append((command, np.where(free, 1.0 - slope / self._half, 0.0), np.where(free, slope, 0.0)))
+        found = np.array(rows)
+        return found[:, 0], found[:, 1], found[:, 2]
+
+    # -- files --------------------------------------------------------------------------------------------------------
+
+    def weights(self) -> Tensors:
+        size, n = self.env.observation_space.shape[0], len(self._half)
+        pull = np.zeros((n, size), dtype=np.float32)
+        place = self.env.spaces.slices["command"].start + np.arange(n)
+        pull[np.arange(n), place] = -self._gain
+        return {
+            "actor.mu.weight": pull,
+            "actor.mu.bias": np.zeros(n, dtype=np.float32),
+            "actor.clock": (self._gain * self.gait).astype(np.float32),
+        }
+
+    def load_weights(self, tensors: Mapping[str, np.ndarray], path: Path) -> None:
+        check_weights({"actor.clock": self.gait.shape}, tensors, path)
+        self.gait = tensors["actor.clock"].astype(float) / self._gain
+
+    def state(self) -> tuple[Tensors, dict[str, Any]]:
+        kept = {"gait": self.gait, "mean": self._mean, "square": self._square}
+        return {name: value.copy() for name, value in kept.items()}, {"step": self.step, "ways": self.ways}
+
+    def restore(self, tensors: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
+        self.gait, self._mean, self._square = (tensors[name].copy() for name in ("gait", "mean", "square"))
+        self.step, self.ways = int(meta["step"]), list(meta["ways"])
+
+    def close(self) -> None:
+        self.env.close()

@@ -1,0 +1,86 @@
+"""The search for gaits along gradients through time: derivatives, what it finds, files, and what it refuses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from softgym_envs.agents.config import EnvironmentConfig, TrainConfig
+from softgym_envs.agents.evaluation import evaluate
+from softgym_envs.agents.learners.gait import GaitLearner
+from softgym_envs.agents.policy import Policy
+from softgym_envs.agents.training import train
+
+WALK = EnvironmentConfig(id="SoftGym/QuadrupedWalk-v0")
+GOAL = np.array([[0.04, 0.0, 0.0]])
+
+
+def config(steps, environment=WALK, **options):
+    given = {"evaluation_episodes": 1, "report_every": steps, **options}
+    return TrainConfig(environment=environment, learner="gait", steps=steps, num_envs=1, **given)
+
+
+def test_the_gradient_is_that_of_the_way(monkeypatch):
+    """Through motion, contact, friction, ramps, limits of rate and the period; the way sideways is charged too."""
+    learner = GaitLearner(config(30, gait={"periods": 2}))
+    # Converged so far that differences of ways are exact.
+    monkeypatch.setattr(learner.backend._dynamics, "tolerance", 1e-11)
+    start, (_, gradient) = learner.gait, learner.climb()
+    row = learner.env.robot.body_frame
+
+    def value(gait):
+        learner.gait = gait
+        learner.backend.reset()
+        x = learner.backend.roll_out(learner.commands(20)[0]).x[:, row]
+        way = x[-1] - x[49]
+        return way[0] - abs(way[1])
+
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        direction = rng.normal(size=start.shape)
+        difference = (value(start + 1e-6 * direction) - value(start - 1e-6 * direction)) / 2e-6
+        assert (gradient * direction).sum() == pytest.approx(difference, rel=1e-4)
+
+
+def test_the_environment_follows_the_commands_of_the_learner():
+    learner = GaitLearner(config(30))
+    weights = learner.weights()
+    observation, _ = learner.env.reset(seed=0)
+    for k, command in enumerate(learner.commands(25)[0]):
+        action = np.tanh(observation @ weights["actor.mu.weight"].T + weights["actor.clock"][k % 10])
+        observation = learner.env.step(action)[0]
+        assert learner.env.command == pytest.approx(command, abs=1e-6 * 4.5e-8)
+
+
+def test_it_walks_farther_than_the_common_gait_and_trains_as_others_do(tmp_path):
+    path = train(config(300), tmp_path / "gait", progress=False)
+    policy = Policy(path)
+    assert policy.remembers and policy.clock.shape == (10, 8)
+    with pytest.raises(ValueError, match="has a memory"):
+        policy(np.zeros(policy.observation_size))
+    found, common = (evaluate(agent, WALK, GOAL) for agent in (path, "gait"))
+    assert found.tallies["speed"][0] > 1.2 * common.tallies["speed"][0]
+    assert found.returns[0] > 1.2 * common.returns[0]  # charges for slip, drift and work included
+
+
+def test_a_resumed_search_gives_the_same_gait():
+    whole, first, second = (GaitLearner(config(90)) for _ in range(3))
+    whole.learn(90, lambda count: None)
+    first.learn(30, lambda count: None)
+    second.load_weights(first.weights(), None)
+    second.restore(*first.state())
+    second.learn(90, lambda count: None)
+    assert (whole.gait == second.gait).all() and whole.ways == second.ways
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"sample_design": ["leg_length"]}, "needs one body"),
+        ({"action_mode": "absolute"}, "got sample_design = False, absolute"),
+        ({"backend_options": {"dynamics": False}}, "needs a motion on finite elements in compiled code: "),
+    ],
+)
+def test_what_it_refuses(changes, words):
+    with pytest.raises(ValueError, match=words):
+        GaitLearner(config(30, WALK.model_copy(update=changes)))
