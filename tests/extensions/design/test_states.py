@@ -104,9 +104,9 @@ def test_a_cavity_whose_walls_pass_through_each_other_is_infeasible():
     lengths |= {"wall_thickness": 0.003899209, "cork_thickness": 0.004741054, "plateau_height": 0.003413125}
     design = {"slope": 0.5589782, **lengths}
     for name in ("relative_volume_change", "volume_change", "angular_displacement"):
-        with pytest.raises(InfeasibleDesign, match="walls of 'cavity_1' pass through each other"):
+        with pytest.raises(InfeasibleDesign, match="walls of 'cavity_\\d' pass through each other"):
             StateEvaluator(robot, [name], actuation=[PULL]).measure(design)
-    with pytest.raises(InfeasibleDesign, match="walls of 'cavity_1' pass through each other"):
+    with pytest.raises(InfeasibleDesign, match="walls of 'cavity_\\d' pass through each other"):
         robot.readings(design)
 
 
