@@ -168,6 +168,20 @@ def test_a_step_on_a_surrogate_loads_no_finite_elements(identifier):
     assert loaded - set(SURROGATE_NEEDS) == set()
 
 
+FEM_LEAVES_OUT = (
+    "contact.contact elements.beams rods skins io solvers.dynamics solvers.beam_body solvers.contact_rows".split()
+)
+"""Modules of mechanics that a step of a solid with cables must not load: 7,000 lines with what they import."""
+
+
+def test_a_step_on_finite_elements_loads_what_it_uses():
+    step = STEP.replace('{identifier}")', 'FingerReach-v0", backend="fem")')
+    done = subprocess.run([sys.executable, "-c", step], capture_output=True, text=True, cwd=ROOT, check=True)
+    loaded = {name.removeprefix("softgym_envs.mechanics.") for name in done.stdout.split()}
+    assert "solvers.statics" in loaded
+    assert loaded & set(FEM_LEAVES_OUT) == set()
+
+
 # -- structure ----------------------------------------------------------------------------------------------------
 
 STRUCTURED = (*FOLDERS, "benchmarks")
