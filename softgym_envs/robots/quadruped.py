@@ -62,7 +62,7 @@ class Quadruped(Robot):
     made_of_beams = True
     goal_axes = np.array([1.0, 1.0, 0.0])
     goal_tolerance = 0.01
-    view = View(axes=(1, 2, 0))
+    view = View(at_rest=True)
     workspace_scale = 0.04
 
     def __init__(
