@@ -320,6 +320,9 @@ class Backend(ABC):
     def restore(self, state: State) -> None:
         """Go back to a state of the current design."""
 
+    def close(self) -> None:  # noqa: B027 - most hold nothing
+        """Free what the backend holds outside of this program, such as a robot; nothing by default."""
+
     def snapshot(self) -> Snapshot:
         """Return all that the next steps depend on."""
         return Snapshot(type(self).__name__, self.design, self.state, self._extra_state())

@@ -274,7 +274,8 @@ class SoftRobotEnv(gymnasium.Env, EzPickle):
         return None if self.render_mode == "human" else image
 
     def close(self) -> None:
-        """Free the renderer."""
+        """Free the renderer, and what the backend holds."""
+        self.backend.close()
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None

@@ -124,6 +124,15 @@ def test_a_stop_takes_the_power(make_bench):
             act()
 
 
+def test_closing_the_environment_takes_the_power(make_bench):
+    moved = make_bench()
+    env = make_env(moved)
+    env.reset(seed=0)
+    env.close()
+    assert not any(servo.powered for servo in moved.emulated.servos.values())
+    env.close()
+
+
 def test_a_fault_of_a_servo_stops_all(make_bench):
     moved = make_bench()
     env = make_env(moved)
