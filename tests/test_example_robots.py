@@ -28,7 +28,7 @@ def test_at_most_45_lines(name):
 
 
 def test_chambers_of_the_bender_mirror_each_other(made):
-    """Equal volumes bend it in its plane of symmetry, one of them sideways; the tendon bends it the other way."""
+    """Equal volumes bend it in its plane of symmetry, one of them sideways."""
     statics = Statics(made("pneunet").build())
     both = statics.solve([1e-6, 1e-6, 0.0])
     assert both.effort[0] == pytest.approx(both.effort[1], rel=0.05) and both.effort[0] > 0.0

@@ -301,7 +301,8 @@ def test_the_baseline_alone_chooses_goals_of_the_finer_mesh(written):
     # Written by hand: changes of -4 mm at all goals of the coarse mesh, and -3, -1, 0, 0 mm on the fine one.
     assert part.before == pytest.approx(-4e-3) and part.goals == 4 and part.ratio == pytest.approx(0.5)
     assert part.left == pytest.approx(2.0 * (2e-3 / 3 + 4e-3 * 2 / 3))
-    assert "half of them missed by the baseline" in findings(snapshot, collect(snapshot))[1].text
+    found = findings(snapshot, collect(snapshot))
+    assert any("half of them missed by the baseline" in finding.text for finding in found)
 
 
 def test_refinements_wait_for_the_winner(written):
