@@ -145,10 +145,13 @@ class FEMBackend(Backend):
             self._set_compliance(model)
             statics = self._solver(model)
             zero = np.zeros(len(self.robot.actuators))
-            try:
-                rest = statics.solve(zero)
-            except ConvergenceError:
-                rest = _relax_dynamically(model, statics, zero)
+            if model.floating and model.contact is None and not model.constraints["b"]:
+                rest = self._afloat(model, zero)
+            else:
+                try:
+                    rest = statics.solve(zero)
+                except ConvergenceError:
+                    rest = _relax_dynamically(model, statics, zero)
             self._dynamics = self._mover(model) if self.moving else None
             self.model, self._statics, self.design = model, statics, complete
             self._rest = self._state(rest, zero, still=True)
@@ -165,6 +168,14 @@ class FEMBackend(Backend):
 
     def _build(self, design: Design) -> MechanicalModel:
         return self.robot.build(design)
+
+    def _afloat(self, model: MechanicalModel, command: np.ndarray) -> Equilibrium:
+        """Return the undeformed shape of a body that nothing holds, with the condensed model of a time step from it."""
+        if not self.moving:
+            raise ValueError(f"nothing holds robot '{self.robot.name}', so it has no equilibrium; pass dynamics=True")
+        moved = self._mover(model).advance(command).equilibrium
+        values = np.concatenate([constraint.value(model.nodes) for constraint, _ in model.rows])
+        return replace(moved, x=model.nodes.copy(), delta=values, effort=np.zeros_like(moved.effort))
 
     def touch(self, load: PointForce | None) -> None:
         load = check_touch(self.robot, self._rest, load)

@@ -22,6 +22,7 @@ ROBOTS = Registry(
         "three_finger_friction_gripper": "softgym_envs.robots.friction_grippers:ThreeFingerFrictionGripper",
         "tetrapod": "softgym_envs.robots.tetrapod:Tetrapod",
         "quadruped": "softgym_envs.robots.quadruped:Quadruped",
+        "swimmer": "softgym_envs.robots.swimmer:Swimmer",
         "three_finger_gripper": "softgym_envs.robots.grippers:ThreeFingerGripper",
     },
     base="softgym_envs.robots.base:Robot",
