@@ -343,10 +343,11 @@ class Assembly:
     ) -> float:
         """Add the forces against strain rates and return their power [W]."""
         beta = inertia.body.stiffness_damping
-        if not beta:
+        if not beta and not any(block.damped for block in self.blocks):
             return 0.0
         rates = StrainRates(inertia.start, inertia.middle(x), velocity, inertia.velocity_factor, beta)
         return sum(
             block.add_damping(x, rates, gradient, values, None if values is None else scatter)
             for block, scatter in zip(self.blocks, self._block_maps, strict=True)
+            if beta or block.damped
         )

@@ -317,9 +317,13 @@ class ContactState:
 
     def begin(self, x: np.ndarray) -> None:
         """Forget the past: all friction springs are relaxed at rows ``x`` (n, 3)."""
-        self._anchors = [pair.local(x) if pair.obstacle.friction > 0.0 else None for pair in self.pairs]
+        self._anchors = list(self.relaxed(x))
         if self._surfaces is not None:
             self._surfaces.begin_increment(self._corners(x))
+
+    def relaxed(self, x: np.ndarray) -> tuple[np.ndarray | None, ...]:
+        """Return anchors of friction springs on obstacles without a stretch at rows ``x`` (n, 3)."""
+        return tuple(pair.local(x) if pair.obstacle.friction > 0.0 else None for pair in self.pairs)
 
     @property
     def memory(self) -> ContactMemory:

@@ -197,6 +197,44 @@ def _evaluate(x, rows, shape, slope, weights, rest, stiffness, row_of, is_slope,
     return energy
 
 
+@njit(cache=True, error_model="numpy")
+def _drag(start, velocity, factor, rows, shape, slope, weights, drag, forces, matrix):
+    """Power of the fluid; forces (m, k, 4, 3) and, unless ``matrix`` is empty, element matrices (m, 12 k, 12 k).
+
+    The resistance per length is ``c_n + (c_t - c_n) t t^T`` with the tangent ``t`` of the axis at rows ``start``.
+    """
+    m, k = rows.shape
+    tangent, speed, pull, D, power = np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3)), 0.0
+    forces[:] = 0.0
+    matrix[:] = 0.0
+    for e in range(m):
+        for q in range(weights.shape[1]):
+            tangent[:] = 0.0
+            speed[:] = 0.0
+            for a in range(k):
+                for d in range(3):
+                    tangent[d] += slope[e, q, a] * start[rows[e, a], d]
+                    speed[d] += shape[q, a] * velocity[rows[e, a], d]
+            square = tangent[0] ** 2 + tangent[1] ** 2 + tangent[2] ** 2
+            for i in range(3):
+                for j in range(3):
+                    D[i, j] = weights[e, q] * (drag[0] - drag[1]) * tangent[i] * tangent[j] / square
+                D[i, i] += weights[e, q] * drag[1]
+            for i in range(3):
+                pull[i] = D[i, 0] * speed[0] + D[i, 1] * speed[1] + D[i, 2] * speed[2]
+                power += pull[i] * speed[i]
+                for a in range(k):
+                    forces[e, a, 0, i] += shape[q, a] * pull[i]
+            if matrix.shape[0] == 0:
+                continue
+            for a in range(k):
+                for b in range(k):
+                    for i in range(3):
+                        for j in range(3):
+                            matrix[e, 12 * a + i, 12 * b + j] += factor * shape[q, a] * shape[q, b] * D[i, j]
+    return power
+
+
 @njit(cache=True)
 def _strains_at(x, rows, shape, slope, out):
     """Fill ``out`` (m, q, 6) with the strains at the Gauss points, those at rest included."""
@@ -283,6 +321,8 @@ class Beam(ElementBlock):
         order: 1 or 2, degree of the interpolation.
         stress_free: rows of the chain's frames in the stress-free shape [m], shape (c, 4, 3); default: as in ``nodes``,
             which may be curved.
+        drag: resistance of a still fluid per length along and across the axis [N s/m2], see `fluid.slender_drag`. It
+            acts in motion alone, on the axis as it lies at the start of each time step.
 
     Attributes:
         rows: first rows of the frames of each element, shape (m, order + 1).
@@ -291,9 +331,10 @@ class Beam(ElementBlock):
         weights: of the Gauss points [m], shape (m, q).
         rest: strains at rest, shape (m, q, 6).
         element_stiffness: of the cross-sections, shape (m, 6), see `Section.stiffness`.
+        drag: as given, shape (2,).
 
     Raises:
-        ValueError: if the chain has the wrong length or two frames coincide.
+        ValueError: if the chain has the wrong length, two frames coincide, or a number is out of bounds.
     """
 
     def __init__(
@@ -307,6 +348,7 @@ class Beam(ElementBlock):
         density: float = 1100.0,
         order: int = 2,
         stress_free: np.ndarray | None = None,
+        drag: tuple[float, float] = (0.0, 0.0),
     ) -> None:
         if order not in (1, 2):
             raise ValueError(f"order = {order!r} of the beam is unknown; allowed: 1, 2")
@@ -347,6 +389,10 @@ class Beam(ElementBlock):
         self.element_stiffness = np.array(
             [s.stiffness(e, nu) for s, e, nu in zip(sections, young, poisson, strict=True)]
         )
+        self.drag = np.asarray(drag, dtype=float)
+        if self.drag.shape != (2,) or not (np.isfinite(self.drag) & (self.drag >= 0.0)).all():
+            raise ValueError(f"drag = {drag!r} N s/m2 must be two finite numbers that are not negative")
+        self.damped = bool(self.drag.any())
         self.density = check_density(density)
         areas = np.array([s.material_area for s in sections])
         length = float(self.weights.sum())
@@ -403,6 +449,9 @@ class Beam(ElementBlock):
         values: np.ndarray | None,
         scatter: list[np.ndarray] | None,
     ) -> float:
+        power = self._add_drag(rates, gradient, values, scatter) if self.damped else 0.0
+        if not rates.damping:
+            return power
         # Damping acts like elasticity of stiffness `viscosity` with a strain at rest that lies `change` behind. The
         # factor is zero where velocities are given; the tangent does not matter there.
         factor = rates.factor or 1.0
@@ -411,7 +460,24 @@ class Beam(ElementBlock):
         change = self._total_strains(rates.middle + half) - self._total_strains(rates.middle - half)
         viscosity = rates.damping * factor * self.element_stiffness
         stored = self._add(x, self._total_strains(x) - change, viscosity, gradient, values, scatter)
-        return 2.0 * factor * stored
+        return power + 2.0 * factor * stored
+
+    def _add_drag(
+        self,
+        rates: StrainRates,
+        gradient: np.ndarray,
+        values: np.ndarray | None,
+        scatter: list[np.ndarray] | None,
+    ) -> float:
+        """Add the forces of the fluid and their tangent, and return their power [W]."""
+        matrix = self._none if values is None else self._matrix
+        power = _drag(
+            rates.start, rates.velocity, rates.factor, self.rows, self.shape, self.slope, self.weights, self.drag,
+            self._forces, matrix,
+        )  # fmt: skip
+        places = np.empty((0, 0), dtype=np.int32) if scatter is None else scatter[0]
+        _scatter(self.rows, self._forces, matrix, gradient, np.empty(0) if values is None else values, places)
+        return float(power)
 
     def _add(
         self,

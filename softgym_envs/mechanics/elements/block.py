@@ -45,6 +45,7 @@ class ElementBlock(ABC):
         volume: rest volume [m3].
         mass: mass [kg].
         stiffness: a typical stiffness against displacements [N/m], for scaling.
+        damped: whether there are forces against velocities besides Rayleigh's damping.
         learned: whether the energy is learned, so that `possible_errors` has rows.
         elasticity_version: increases with every change of the elasticity, so that solvers can detect it.
     """
@@ -53,6 +54,7 @@ class ElementBlock(ABC):
     volume: float
     mass: float
     stiffness: float
+    damped: bool = False
     learned: bool = False
     elasticity_version: int = 0
 

@@ -16,11 +16,32 @@ from softgym_envs.mechanics.compilation import FAST, njit
 from softgym_envs.mechanics.contact.compiled import quick_gap, stretch_of, touch_point
 from softgym_envs.mechanics.elements.beam_kernels import add_forces, interpolate, pull_back
 from softgym_envs.mechanics.solvers.beam_contact import has_failed, point_at, spread_of
-from softgym_envs.mechanics.solvers.beam_equations import Step, assemble, multiply_mass, point_strains
+from softgym_envs.mechanics.solvers.beam_equations import (
+    Step,
+    assemble,
+    between,
+    multiply_mass,
+    point_strains,
+    resistance,
+)
 from softgym_envs.mechanics.solvers.beam_frames import reduce_forces, rows_moved
 from softgym_envs.mechanics.solvers.beam_motion import Stepping, copy_state, march_rows, restore_state
 from softgym_envs.mechanics.solvers.beam_newton import factorise_tangent, invert_driven
 from softgym_envs.mechanics.solvers.block_cholesky import solve_lower, solve_upper
+
+
+class Adjoint(NamedTuple):
+    """What multiplies the equations of recorded steps; no steps, s = 0, where it is not asked for.
+
+    Attributes:
+        motion: multipliers of the equations of each step, shape (s, b, 6).
+        value: of the values of driven rows, shape (s, size).
+        anchors: derivatives by the anchors after each step, shape (s, o, p, 3); None for a body that touches nothing.
+    """
+
+    motion: np.ndarray
+    value: np.ndarray
+    anchors: np.ndarray | None
 
 
 class Tape(NamedTuple):
@@ -87,7 +108,7 @@ def record(system, strains, state, targets, drive, stepping, tape):
             stepping.mass_damping,
             stepping.stiffness_damping,
             stepping.tolerance,
-            1,
+            min(stepping.cuts, 1),  # no literal, for which everything would be compiled again
         )
         if parts > 1:
             first[:] = kept.effort
@@ -144,6 +165,31 @@ def _add_damping(elements, x, y, moved, rate, out):
             pull[:] = 0.0
             pull_back(z, along, pull)
             add_forces(pull, frames, shape, slope, out)
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _add_resistance(elements, x, y, moved, rate, out):
+    """Subtract from ``out`` (n, 3) the product of ``moved`` (n, 3) with the derivative of drag by rows ``x`` (n, 3)."""
+    D, t, u, m, still = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3), np.zeros_like(moved)
+    for e in range(elements.drag.shape[0]):
+        frames = elements.frames[e]
+        for q in range(2):
+            shape, slope = elements.shape[q], elements.slope[e, q]
+            resistance(elements, e, q, x, D)
+            between(elements, e, q, x, y, u)
+            between(elements, e, q, still, moved, m)
+            square, a, b = 0.0, 0.0, 0.0
+            for i in range(3):
+                t[i] = slope[0] * x[frames[0], i] + slope[1] * x[frames[1], i] + slope[2] * x[frames[2], i]
+                square += t[i] * t[i]
+                a += t[i] * u[i]
+                b += t[i] * m[i]
+            turning = rate * (elements.drag[e, q, 0] - elements.drag[e, q, 1]) / square
+            for i in range(3):
+                back = rate * (D[i, 0] * m[0] + D[i, 1] * m[1] + D[i, 2] * m[2])
+                turned = turning * (a * m[i] + b * u[i] - 2.0 * a * b / square * t[i])
+                for k in range(3):
+                    out[frames[k], i] += shape[k] * back - slope[k] * turned
 
 
 @njit(cache=True, error_model="numpy")
@@ -306,7 +352,7 @@ def _solve_back(system, drive, right, by_effort, by_target):
 
 
 @njit(cache=True, error_model="numpy")
-def go_back(system, strains, tape, count, drive, stepping, by_x, by_velocity, by_effort, by_targets, start):
+def go_back(system, strains, tape, count, drive, stepping, by_x, by_velocity, by_effort, by_targets, start, adjoint):
     """Pull the derivatives of a scalar by states back through recorded steps; whether all tangents were regular.
 
     Args:
@@ -320,7 +366,8 @@ def go_back(system, strains, tape, count, drive, stepping, by_x, by_velocity, by
         by_velocity: by the velocities of the rows, shape (k, n, 3).
         by_effort: by the efforts, shape (k, size).
         by_targets: is filled with those by the commands, shape (k, size).
-        start: arrays of `Start`, which are filled.
+        start: derivatives by the rows, the velocities and the anchors at the start, which are filled.
+        adjoint: arrays of `Adjoint`, which are filled if they have steps.
     """
     body, equations, factor = system
     xs, velocities, anchors = start
@@ -338,6 +385,9 @@ def go_back(system, strains, tape, count, drive, stepping, by_x, by_velocity, by
             velocities += by_velocity[k]
             efforts += by_effort[k]
         held = _anchors_at(tape.anchors, s)
+        keeps = adjoint.motion.shape[0] > 0
+        if keeps:
+            _keep(adjoint.anchors, s, anchors)
         # Rows and velocities at the end, and anchors that have followed the points.
         _commit_back(body.contact, equations.slides, y, held, anchors, xs)
         for row in range(xs.shape[0]):
@@ -364,6 +414,9 @@ def go_back(system, strains, tape, count, drive, stepping, by_x, by_velocity, by
             return False
         invert_driven(factor, drive.driven)
         _solve_back(system, drive, right, efforts, by_target)
+        if keeps:
+            adjoint.motion[s] = right
+            adjoint.value[s] = by_target
         share, before = tape.share[s], k > 0 and tape.share[s] < 1.0
         for c in range(by_target.shape[0]):
             by_targets[k, c] += share * by_target[c]
@@ -378,5 +431,6 @@ def go_back(system, strains, tape, count, drive, stepping, by_x, by_velocity, by
                 xs[row, d] += (rate + stepping.mass_damping) * rate * forces[row, d]
                 velocities[row, d] = rate * forces[row, d]
         _add_damping(body.elements, x, y, moved, stepping.stiffness_damping * rate, xs)
+        _add_resistance(body.elements, x, y, moved, rate, xs)
         _friction_back(body.contact, equations.slides, y, held, moved, anchors)
     return True

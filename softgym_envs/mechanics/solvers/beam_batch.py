@@ -94,7 +94,7 @@ class BeamBatch:
     """
 
     def __init__(self, bodies: Sequence[BeamBody], loads: Sequence[np.ndarray]) -> None:
-        self._bodies = _stacked(bodies)
+        self._bodies = stacked(bodies)
         self._loads = np.ascontiguousarray(loads)
         body = bodies[0]
         size = len(body.servos.number) + 3 * len(body.points.number) + len(body.chambers.number)
@@ -153,24 +153,24 @@ class BeamBatch:
         return solved, stable
 
 
-def _stacked(parts: Sequence[Any]) -> Any:
+def stacked(parts: Sequence[Any]) -> Any:
     """Return named tuples of arrays as one, whose arrays have a further axis in front."""
     first = parts[0]
     if first is None:
         return None
     if isinstance(first, np.ndarray):
         return np.stack(parts)  # a ValueError for other shapes
-    return type(first)(*(_stacked(fields) for fields in zip(*parts, strict=True)))
+    return type(first)(*(stacked(fields) for fields in zip(*parts, strict=True)))
 
 
 @njit(cache=True, error_model="numpy")
-def _body(all_bodies, k):
+def body_of(all_bodies, k):
     """Return body ``k`` of stacked bodies."""
     e, r, f, m = all_bodies.elements, all_bodies.rows, all_bodies.frames, all_bodies.masses
     b, c, s = all_bodies.pattern, all_bodies.components, all_bodies.servos
     p, h = all_bodies.points, all_bodies.chambers
     return BeamBody(
-        Elements(e.frames[k], e.shape[k], e.slope[k], e.stiffness[k], e.rest[k], e.mount[k], e.place[k]),
+        Elements(e.frames[k], e.shape[k], e.slope[k], e.stiffness[k], e.rest[k], e.mount[k], e.place[k], e.drag[k]),
         Rows(r.kind[k], r.block[k], r.origin[k]),
         MovingFrames(f.rows[k], f.block[k], f.mounted[k], f.owner[k], f.moves[k], f.arm[k]),
         Masses(m.pointers[k], m.columns[k], m.values[k], m.pairs[k], m.entries[k]),
@@ -259,7 +259,7 @@ def _march_all(
             np.zeros(7),
         )
         taken = march(
-            System(_body(bodies, numbers[k]), q, f),
+            System(body_of(bodies, numbers[k]), q, f),
             strains,
             state,
             targets[k],

@@ -37,6 +37,8 @@ class Elements(NamedTuple):
         mount: row of the origin of the frame on which each frame is mounted, or -1, shape (m, 3).
         place: block of the tangent for each pair of an element's frames, shape (m, 3, 3); -1 below the diagonal, and
             where one of them is fixed.
+        drag: weight times resistance of the fluid along and across the axis, shape (m, 2, 2) [N s/m]; no elements,
+            shape (0, 2, 2), for a body without.
     """
 
     frames: np.ndarray
@@ -46,6 +48,7 @@ class Elements(NamedTuple):
     rest: np.ndarray
     mount: np.ndarray
     place: np.ndarray
+    drag: np.ndarray
 
 
 class Rows(NamedTuple):
@@ -295,6 +298,9 @@ def beam_body(model: MechanicalModel, mass: MassMatrix) -> BeamBody:
             rest=np.concatenate([beam.rest for beam in beams]),
             mount=np.where(kind[elements] == MOUNTED, frames.rows[owner[elements]], -1),
             place=_element_places(block[elements], pattern),
+            drag=np.concatenate([beam.weights[:, :, None] * beam.drag for beam in beams])
+            if any(beam.damped for beam in beams)
+            else np.empty((0, 2, 2)),
         ),
         rows=Rows(kind, block, np.where(kind == FIXED, -1, frames.rows[owner])),
         frames=MovingFrames(
@@ -344,11 +350,22 @@ def _following(frames: Frames, count: int) -> csr_matrix:
 
 
 def _own_masses(matrix: csr_matrix, frames: Frames, count: int) -> csr_matrix:
-    """Return the mass matrix of ``count`` rows with the masses of rows that follow frames given to the frames' rows."""
+    """Return the mass matrix of ``count`` rows with the masses of rows that follow frames given to the frames' rows.
+
+    Entries that vanish for some designs stay, so that all bodies of a robot have the same layout.
+    """
     follow = _following(frames, count)
-    found = csr_matrix(follow.T @ matrix @ follow)
-    found.eliminate_zeros()
-    return found
+    found, used = csr_matrix(follow.T @ matrix @ follow), (_pattern(follow), _pattern(matrix))
+    layout = csr_matrix(used[0].T @ used[1] @ used[0])
+    layout.sort_indices()
+    rows = np.repeat(np.arange(count), np.diff(layout.indptr))
+    layout.data = np.asarray(found[rows, layout.indices]).ravel()
+    return layout
+
+
+def _pattern(matrix: csr_matrix) -> csr_matrix:
+    """Return a matrix with ones where another one has entries, zero or not."""
+    return csr_matrix((np.ones(matrix.nnz), matrix.indices, matrix.indptr), shape=matrix.shape)
 
 
 def _masses(matrix: csr_matrix, rows: np.ndarray, blocks: np.ndarray, pattern: BlockPattern) -> Masses:

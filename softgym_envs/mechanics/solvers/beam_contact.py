@@ -392,6 +392,20 @@ def free_part(contact, slides, start, end):
 
 
 @njit(cache=True, error_model="numpy")
+def catch_up(p, area, obstacle, edges, anchor, law, found, totals):
+    """Move the anchor (3,) of a touching point so that its spring carries no more than it can; see `commit`."""
+    stored, _, _, pressing, _ = touch_point(p, area, obstacle, edges, anchor, law, True, found)
+    totals[1] += stored
+    for d in range(3):
+        friction = found.pull[d] + pressing * found.normal[d]
+        elastic = friction / (law[2] * area)
+        new = p[d] - elastic
+        totals[1] += 0.5 * friction * elastic
+        totals[3] += friction * (new - anchor[d])
+        anchor[d] = new
+
+
+@njit(cache=True, error_model="numpy")
 def commit(contact, slides, x, anchors, totals):
     """Let springs that slid at the accepted rows ``x`` (n, 3) catch up, as `ContactState.commit`.
 
@@ -412,16 +426,7 @@ def commit(contact, slides, x, anchors, totals):
                     for d in range(3):
                         anchor[d] = p[d]
                     continue
-                area, pull = contact.area[k], found.pull
-                stored, _, _, pressing, _ = touch_point(p, area, obstacle, edges, anchor, law, True, found)
-                totals[1] += stored
-                for d in range(3):
-                    friction = pull[d] + pressing * found.normal[d]
-                    elastic = friction / (law[2] * area)
-                    new = p[d] - elastic
-                    totals[1] += 0.5 * friction * elastic
-                    totals[3] += friction * (new - anchor[d])
-                    anchor[d] = new
+                catch_up(p, contact.area[k], obstacle, edges, anchor, law, found, totals)
 
 
 @njit(cache=True, error_model="numpy")

@@ -117,6 +117,84 @@ def strain_work(elements, x, step):
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
+def resistance(elements, e, q, x, out):
+    """Fill ``out`` (3, 3) with the resistance of the fluid at a Gauss point [N s/m] at rows ``x`` (n, 3).
+
+    Along the axis it is less than across: ``c_n + (c_t - c_n) t t^T`` with the tangent ``t``.
+    """
+    i, j, k = elements.frames[e]
+    a, b, c = elements.slope[e, q]
+    along, across = elements.drag[e, q]
+    p = a * x[i, 0] + b * x[j, 0] + c * x[k, 0]
+    r = a * x[i, 1] + b * x[j, 1] + c * x[k, 1]
+    s = a * x[i, 2] + b * x[j, 2] + c * x[k, 2]
+    factor = (along - across) / (p * p + r * r + s * s)
+    out[0, 0], out[0, 1], out[0, 2] = across + factor * p * p, factor * p * r, factor * p * s
+    out[1, 0], out[1, 1], out[1, 2] = out[0, 1], across + factor * r * r, factor * r * s
+    out[2, 0], out[2, 1], out[2, 2] = out[0, 2], out[1, 2], across + factor * s * s
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def between(elements, e, q, start, end, out):
+    """Fill ``out`` (3,) with the way of the axis at a Gauss point between rows ``start`` and ``end`` (n, 3) [m]."""
+    i, j, k = elements.frames[e]
+    a, b, c = elements.shape[q]
+    for d in range(3):
+        out[d] = a * (end[i, d] - start[i, d]) + b * (end[j, d] - start[j, d]) + c * (end[k, d] - start[k, d])
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def drag_work(elements, x, step):
+    """Return the work [J] that the fluid takes on the way from the start of a step to rows ``x`` (n, 3)."""
+    D, way, work = np.empty((3, 3)), np.empty(3), 0.0
+    for e in range(elements.drag.shape[0]):
+        for q in range(2):
+            resistance(elements, e, q, step.x, D)
+            between(elements, e, q, step.x, x, way)
+            for i in range(3):
+                for j in range(3):
+                    work += way[i] * D[i, j] * way[j]
+    return work / step.h
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
+def _add_drag(elements, x, step, equations, full):
+    """Add the resistance of the fluid to the motion from the start of the step, with the axis as it was there."""
+    rate = 1.0 / step.h
+    if rate == 0.0 or elements.drag.shape[0] == 0:
+        return
+    D, way, block = np.empty((3, 3)), np.empty(3), np.empty((6, 6))
+    for e in range(elements.drag.shape[0]):
+        frames, mount, place = elements.frames[e], elements.mount[e], elements.place[e]
+        for q in range(2):
+            shape = elements.shape[q]
+            resistance(elements, e, q, step.x, D)
+            between(elements, e, q, step.x, x, way)
+            for i in range(3):
+                pull = rate * (D[i, 0] * way[0] + D[i, 1] * way[1] + D[i, 2] * way[2])
+                for a in range(3):
+                    equations.gradient[frames[a], i] += shape[a] * pull
+            if not full:
+                continue
+            for a in range(3):
+                for b in range(3):
+                    if place[a, b] < 0:
+                        continue
+                    block[:] = 0.0
+                    for i in range(3):
+                        for j in range(3):
+                            block[i, j] = rate * shape[a] * shape[b] * D[i, j]
+                    if mount[a] >= 0:
+                        _add_arms(x, frames[a], mount[a], block, False)
+                    if mount[b] >= 0:
+                        _add_arms(x, frames[b], mount[b], block, True)
+                    target = equations.tangent[place[a, b]]
+                    for i in range(6):
+                        for j in range(6):
+                            target[i, j] += block[i, j]
+
+
+@njit(cache=True, error_model="numpy", fastmath=FAST)
 def _add_arms(x, own, mounted, block, transposed):
     """Let the first frame of a block (6, 6) of the tangent follow the frame on which it is mounted, or the second one.
 
@@ -136,7 +214,7 @@ def _add_arms(x, own, mounted, block, transposed):
             block[5, c] += p * v - q * u
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
 def _add_tangent(elements, e, x, z, stress, rate, work, tangent):
     """Add the tangent of an element to its blocks.
 
@@ -453,6 +531,7 @@ def assemble(body, x, effort, step, equations, full):
     if full:
         equations.tangent[:] = 0.0
     _add_elements(body.elements, x, step, equations, full)
+    _add_drag(body.elements, x, step, equations, full)
     _add_inertia(body.masses, x, step, equations, full)
     add_constraints(body, x, effort, equations, full)
     add_contact(body.contact, equations.slides, x, step.anchors, equations, full)

@@ -33,6 +33,7 @@ from softgym_envs.mechanics.solvers.beam_equations import (
     Step,
     add_constraints,
     assemble,
+    drag_work,
     multiply_mass,
     point_strains,
     strain_work,
@@ -196,7 +197,7 @@ def _predict(contact, slides, body, factor, start, x):
 
 @njit(cache=True, error_model="numpy")
 def _find_free(system, x, effort, target, drive, step, stepping, fresh, easy):
-    """Do what `_find` says for a body that touches nothing."""
+    """Solve the equations of a time step of a body that touches nothing; the iterations, or -1 on failure."""
     h, tolerance = step.h, stepping.tolerance
     predicted, kept_effort = x.copy(), effort.copy()
     iterations = -1
@@ -213,28 +214,23 @@ def _find_free(system, x, effort, target, drive, step, stepping, fresh, easy):
     return iterations
 
 
-@njit(cache=True, error_model="numpy")
-def _find_touching(system, x, effort, target, drive, step, stepping, fresh, easy):
-    """Do what `_find` says for a body that may touch."""
+def _find(system, x, effort, target, drive, step, stepping, fresh, easy):
+    """Solve the equations of one time step from the predicted rows; the iterations, or -1 on failure."""
+    if system.body.contact is None:
+        return _find_free(system, x, effort, target, drive, step, stepping, fresh, easy)
     return solve_in_contact(system, x, effort, target, drive, step, stepping.tolerance, fresh)
 
 
-def _find(system, x, effort, target, drive, step, stepping, fresh, easy):
-    """Solve the equations of one time step from the predicted rows; the iterations, or -1 on failure."""
-    found = _find_free if system.body.contact is None else _find_touching
-    return found(system, x, effort, target, drive, step, stepping, fresh, easy)
-
-
-@overload(_find)
+@overload(_find, inline="always")
 def _compiled_find(system, x, effort, target, drive, step, stepping, fresh, easy):
-    """Choose when a kernel is compiled, so that only one of both is."""
-    touches = not isinstance(system.types[0].types[system.types[0].fields.index("contact")], types.NoneType)
-    found = _find_touching if touches else _find_free
-
-    def find(system, x, effort, target, drive, step, stepping, fresh, easy):
-        return found(system, x, effort, target, drive, step, stepping, fresh, easy)
-
-    return find
+    """Choose when a kernel is compiled: with contact, the other method would double the time of compilation."""
+    if isinstance(system.types[0].types[system.types[0].fields.index("contact")], types.NoneType):
+        return lambda system, x, effort, target, drive, step, stepping, fresh, easy: _find_free(
+            system, x, effort, target, drive, step, stepping, fresh, easy
+        )
+    return lambda system, x, effort, target, drive, step, stepping, fresh, easy: solve_in_contact(
+        system, x, effort, target, drive, step, stepping.tolerance, fresh
+    )
 
 
 @njit(cache=True, error_model="numpy")
@@ -285,7 +281,7 @@ def _advance(system, strains, state, target, drive, stepping, h, fresh, easy, fi
             kinetic += 0.5 * velocity[i, d] * momentum[i, d]
     totals[0] = kinetic
     totals[1], drag = strain_work(body.elements, x, step)
-    totals[3] += drag + 2.0 * alpha * h * kinetic
+    totals[3] += drag + drag_work(body.elements, x, step) + 2.0 * alpha * h * kinetic
     commit(body.contact, equations.slides, x, state.anchors, totals)
     return True
 

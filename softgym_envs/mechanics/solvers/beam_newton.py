@@ -231,7 +231,7 @@ def _correct(system, effort, target, drive):
     return largest
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")
 def _linearise(system, x, effort, step, drive, rows, definite):
     """Assemble and factorise at rows ``x``; the number of negative eigenvalues, or -1 if there is no factor.
 
@@ -402,7 +402,7 @@ def _take(system, kept, x, stride, part):
     move(system.body.frames, x, factor.step, factor.turned)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")
 def _part_of_step(system, kept, x, stride, effort, step, most, start):
     """Return the part of a step, up to ``most``, at which the forces along it vanish; rows ``x`` are moved by it.
 

@@ -9,7 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from softgym_envs.errors import ConvergenceError
-from softgym_envs.mechanics.solvers.beam_adjoint import Tape, go_back, record
+from softgym_envs.mechanics.contact.contact import ContactMemory
+from softgym_envs.mechanics.solvers.beam_adjoint import Adjoint, Tape, go_back, record
+from softgym_envs.mechanics.solvers.beam_design import Neighbours, by_bodies
 from softgym_envs.mechanics.solvers.beam_motion import BeamState, Stepping, anchors_of, memory_of
 from softgym_envs.mechanics.solvers.beam_newton import Drive
 from softgym_envs.mechanics.solvers.dynamics import Dynamics
@@ -25,11 +27,13 @@ class Gradient(NamedTuple):
         commands: by the commands, shape (k, n_a).
         x: by the rows at the start, shape (n, 3). Only its product with motions that the body can make has a meaning.
         velocity: by the velocities of the rows at the start, shape (n, 3).
+        design: by design variables, shape (d,); none where no neighbours of the body were given.
     """
 
     commands: np.ndarray
     x: np.ndarray
     velocity: np.ndarray
+    design: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -58,6 +62,7 @@ class Rollout:
         by_x: np.ndarray | None = None,
         by_velocity: np.ndarray | None = None,
         by_effort: np.ndarray | None = None,
+        neighbours: Neighbours | None = None,
     ) -> Gradient:
         """Return the derivatives of a scalar, through contact and friction, at about the cost of the rollout.
 
@@ -69,16 +74,25 @@ class Rollout:
                 shape (n, 3); default zero.
             by_velocity: by the velocities of the rows, likewise.
             by_effort: by the efforts, shape (k, size) or (size,).
+            neighbours: of the body, for derivatives by its design. A motion that began with `Statics.reset` begins with
+                the shape at rest of any body; one that began elsewhere, with the frames where they were.
 
         Raises:
             ConvergenceError: if a tangent is singular.
-            ValueError: for another shape.
+            ValueError: for another shape, or neighbours of another body.
         """
         beams = self.dynamics.beam_solver()
         assert beams is not None
         targets = np.zeros_like(self.effort)
         anchors = None if self._tape.anchors is None else np.zeros_like(self._tape.anchors[0])
         start = np.zeros_like(self.x[0]), np.zeros_like(self.x[0]), anchors
+        steps = 0 if neighbours is None else self._count
+        adjoint = Adjoint(
+            np.zeros((steps, *beams.system.factor.step.shape)),
+            np.zeros((steps, self.effort.shape[1])),
+            None if anchors is None else np.zeros((steps, *anchors.shape)),
+        )
+        given = _over_time("by_x", by_x, self.x.shape), _over_time("by_velocity", by_velocity, self.x.shape)
         found = go_back(
             beams.system,
             beams.strains,
@@ -86,16 +100,63 @@ class Rollout:
             self._count,
             self._drive,
             self._stepping,
-            _over_time("by_x", by_x, self.x.shape),
-            _over_time("by_velocity", by_velocity, self.x.shape),
+            *given,
             _over_time("by_effort", by_effort, self.effort.shape),
             targets,
             start,
+            adjoint,
         )
         if not found:
             raise ConvergenceError("the tangent of a recorded time step is singular", fraction=0.0)
         actuators = sum(c.size for c in self.dynamics.model.constraints["a"])
-        return Gradient(targets[:, :actuators], start[0], start[1])
+        design = np.empty(0) if neighbours is None else self._by_design(neighbours, adjoint, given, start)
+        return Gradient(targets[:, :actuators], start[0], start[1], design)
+
+    def _by_design(
+        self,
+        neighbours: Neighbours,
+        adjoint: Adjoint,
+        given: tuple[np.ndarray, np.ndarray],
+        start: tuple[np.ndarray, np.ndarray, np.ndarray | None],
+    ) -> np.ndarray:
+        """Return derivatives by design variables (d,) from the adjoint of the steps and derivatives by the start."""
+        beams = self.dynamics.beam_solver()
+        assert beams is not None
+        own, at_rest = self.dynamics.model.nodes, 1.0 if self._began_at_rest() else 0.0
+        neighbours.check_like(beams.body)
+        out = np.empty(len(neighbours.loads))
+        found = by_bodies(
+            neighbours.bodies,
+            neighbours.loads,
+            neighbours.nodes,
+            own,
+            beams.equations,
+            beams.strains,
+            self._tape,
+            self._count,
+            self._drive,
+            self._stepping,
+            adjoint,
+            given,
+            (start[0], start[2], at_rest),
+            out,
+        )
+        if not found:
+            raise ConvergenceError("a neighbour of the body is inside an obstacle on the recorded motion", fraction=0.0)
+        return (out[::2] - out[1::2]) / neighbours.spans
+
+    def _began_at_rest(self) -> bool:
+        """Whether the motion began with the undeformed body, at rest, with relaxed springs of friction."""
+        dynamics, tape = self.dynamics, self._tape
+        nodes, touching = dynamics.model.nodes, dynamics.linearisation.contact
+        if not np.array_equal(tape.x[0], nodes) or tape.velocity[0].any():
+            return False
+        beams = dynamics.beam_solver()
+        if touching is None or tape.anchors is None or beams is None or beams.body.contact is None:
+            return True
+        return np.array_equal(
+            tape.anchors[0], anchors_of(beams.body.contact, ContactMemory(touching.relaxed(nodes), None))
+        )
 
 
 def _over_time(name: str, values: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:

@@ -204,7 +204,7 @@ class Statics(Newton):
             done, carried = level, linear.loads
             size *= 1.5
             found = self._state(target, driven, iterations, increments)
-            if linear.has_friction:
+            if linear.has_friction and (done == 1.0 or linear.inertia is None):  # springs slide once in a time step
                 self._accept()
                 found = replace(found, memory=self.memory)
         if (impossible := self._shape.problem(self.x)) is not None:
