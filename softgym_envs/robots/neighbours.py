@@ -9,9 +9,9 @@ import numpy as np
 from softgym_envs.mechanics.solvers.beam_design import Neighbours
 from softgym_envs.robots.base import Robot
 
-STEP = 1e-6
-"""Distance of neighbours as a part of the range of a variable: differences of the equations are then exact to eight
-digits or so, far more than the motion itself."""
+STEP = 1e-5
+"""Distance of neighbours as a part of the range of a variable: round-off of the equations and the
+curvature of contact then count alike, in the seventh digit or so."""
 
 
 def neighbours_of(robot: Robot, design: Mapping[str, float] | None = None) -> Neighbours:

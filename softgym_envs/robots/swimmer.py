@@ -33,7 +33,7 @@ CORNERS = 12
 """Corners of the sections that are drawn."""
 PERIOD = 20
 """Control steps of a period of the plain gait."""
-STROKE = 4.0e-9
+STROKE = 1.0e-8
 """Volume by which its chambers change [m3]."""
 
 
@@ -75,14 +75,14 @@ class Swimmer(Robot):
         self.viscosity = float(viscosity)
         self.design_space = DesignSpace(
             DesignVariable("length", 0.100, 0.200, 0.150, "m", "length of the body"),
-            DesignVariable("radius", 0.004, 0.008, 0.006, "m", "radius of the head"),
-            DesignVariable("taper", 0.4, 1.0, 0.8, "1", "radius of the end of the tail over that of the head"),
+            DesignVariable("radius", 0.005, 0.008, 0.006, "m", "radius of the head"),
+            DesignVariable("taper", 0.7, 1.0, 0.8, "1", "radius of the end of the tail over that of the head"),
             DesignVariable("tail", 0.1, 0.5, 0.2, "1", "part of the length without chambers"),
             DesignVariable("young_modulus", 5.0e4, 5.0e5, 1.5e5, "Pa", "stiffness of the silicone", log=True),
         )
         self.effector_rest = np.zeros(3)
         self.actuators = tuple(
-            Actuator(f"{k + 1}_{side}", -8.0e-9, 8.0e-9, 1.5e-9, unit="m3", unilateral=False)
+            Actuator(f"{k + 1}_{side}", -1.2e-8, 1.2e-8, 4.0e-9, unit="m3", unilateral=False)
             for k in range(SEGMENTS)
             for side in ("left", "right")
         )

@@ -35,7 +35,7 @@ def weighted(rollout, seed=0):
 
 def check(build, values, sizes, roll, *, seed=0):
     """Compare derivatives by design variables of a whole rollout with differences of rollouts of other bodies."""
-    neighbours = Neighbours.of(build, values, 1e-6 * sizes)
+    neighbours = Neighbours.of(build, values, 1e-5 * sizes)
     rollout = roll(build(values))
     _, given = weighted(rollout, seed)
     gradient = rollout.gradient(**given, neighbours=neighbours).design

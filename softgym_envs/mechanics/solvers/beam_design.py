@@ -54,8 +54,8 @@ class Neighbours:
         Args:
             build: returns the model of design variables (d,).
             values: of the design, shape (d,).
-            steps: distances of the neighbours, shape (d,); a millionth of a variable's range serves: differences are
-                then exact to eight digits or so, far more than what follows from a rollout.
+            steps: distances of the neighbours, shape (d,); 1e-5 of a variable's range serves: round-off and the
+                curvature of contact then count alike, in the seventh digit or so.
             bounds: smallest and largest values, shapes (d,), which are not exceeded.
 
         Raises:
@@ -143,7 +143,7 @@ def _follow(frames, rows):
 
 @njit(cache=True, error_model="numpy")
 def _anchor_work(contact, slides, x, anchors, by_anchors):
-    """Return the product of ``by_anchors`` with the anchors after a step that ends at rows ``x``, from ``anchors``.
+    """Return the product of ``by_anchors`` with how anchors move in a step that ends at rows ``x``, from ``anchors``.
 
     Nearly all of ``by_anchors`` is zero: those of points that do not touch in the next step.
     """
@@ -164,7 +164,7 @@ def _anchor_work(contact, slides, x, anchors, by_anchors):
                     q[:] = anchors[o, k]
                     catch_up(p, contact.area[k], obstacle, edges, q, law, slides.touch, unused)
                 for d in range(3):
-                    value += q[d] * by[d]
+                    value += (q[d] - anchors[o, k, d]) * by[d]
     return value
 
 
@@ -248,7 +248,8 @@ def by_bodies(bodies, loads, nodes, own, equations, strains, tape, count, drive,
                 c = tape.number[s]
                 for row in range(own.shape[0]):
                     for d in range(3):
-                        total += by_x[c, row, d] * now[row, d] + by_velocity[c, row, d] * velocity[row, d]
+                        moved = now[row, d] - tape.x[s + 1, row, d]  # small numbers have small errors
+                        total += by_x[c, row, d] * moved + by_velocity[c, row, d] * velocity[row, d]
             before[:] = now
         out[k] = total
     return True
