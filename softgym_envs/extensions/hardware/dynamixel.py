@@ -49,8 +49,8 @@ MULTI_TURN, CURRENT_AND_POSITION = 4, 5
 
 FAULTS = {0: "input voltage", 2: "overheating", 3: "encoder", 4: "electrical shock", 5: "overload"}
 """Bits of the hardware error status."""
-PATIENCE = 0.030
-"""Time that a servo has to answer, besides the loop [s]."""
+PATIENCE = 1.0
+"""Time that a servo has to answer while nothing has power [s]; later half of the watchdog's."""
 
 
 class ServoConfig(Config):
@@ -128,7 +128,7 @@ class Dynamixel(Device):
         self._per_current = np.array([CURRENT * (servo.torque_constant or np.nan) / servo.radius for servo in servos])
         self._per_current *= np.sign(self._per_tick)
         self._line = line or SerialLine(config.port, config.baud, clock)
-        self._stream = Stream()
+        self._stream, self._patience = Stream(), PATIENCE
 
     # -- instructions -----------------------------------------------------------------------------------------------
 
@@ -154,7 +154,7 @@ class Dynamixel(Device):
         for _ in range(3):  # a single packet may be lost
             self._clear()
             self._send(Packet(servo.id, instruction, data))
-            until = self._clock.now() + PATIENCE
+            until = self._clock.now() + self._patience
             answer = next((p for p in self._answers(1, until) if p.servo == servo.id), None)
             if answer is not None:
                 break
@@ -210,6 +210,7 @@ class Dynamixel(Device):
         return found
 
     def start(self, watchdog: float, speed: np.ndarray) -> None:
+        self._patience = 0.5 * watchdog
         for k, (name, servo) in enumerate(self._servos.items()):
             self._set(name, BUS_WATCHDOG, 0)  # ends an earlier stop
             mode = MULTI_TURN if servo.max_current is None else CURRENT_AND_POSITION

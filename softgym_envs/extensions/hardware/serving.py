@@ -26,7 +26,7 @@ from softgym_envs.extensions.hardware.pressure_board import PressureBoardConfig
 
 TRACKER_RATE = 100.0
 """Positions that are sent per second."""
-PATIENCE = 120.0
+PATIENCE = 600.0
 """Time that the process of an emulation has to start, the compilation of kernels included [s]."""
 
 
