@@ -268,17 +268,45 @@ def _inside_out(x, tetrahedra):
     return -1
 
 
+@njit(cache=True, error_model="numpy")
+def _quadratic_inside_out(x, cells):
+    """The first quadratic tetrahedron (m, 10) whose map has no positive determinant at a corner, or -1.
+
+    The edges of the cell are curved, so the tetrahedron of its corners says nothing.
+    """
+    corners = ((0, 1, 2, 3), (1, 0, 3, 2), (2, 0, 1, 3), (3, 0, 2, 1))
+    midside = ((-1, 4, 6, 7), (4, -1, 5, 8), (6, 5, -1, 9), (7, 8, 9, -1))
+    t = np.empty((3, 3))
+    for e in range(cells.shape[0]):
+        for k in range(4):
+            o = corners[k][0]
+            for row in range(3):
+                other = corners[k][row + 1]
+                for axis in range(3):  # derivative of the map along an edge, at the corner
+                    t[row, axis] = (
+                        4.0 * x[cells[e, midside[o][other]], axis]
+                        - 3.0 * x[cells[e, o], axis]
+                        - x[cells[e, other], axis]
+                    )
+            cross0 = t[1, 1] * t[2, 2] - t[1, 2] * t[2, 1]
+            cross1 = t[1, 2] * t[2, 0] - t[1, 0] * t[2, 2]
+            cross2 = t[1, 0] * t[2, 1] - t[1, 1] * t[2, 0]
+            if t[0, 0] * cross0 + t[0, 1] * cross1 + t[0, 2] * cross2 <= 0.0:
+                return e
+    return -1
+
+
 class ShapeCheck:
     """Whether a state can be one: no wall of a cavity has passed through another, and no cell is inside out.
 
     The walls of a cavity may not cross each other, those of another cavity, or the outside of a solid; where a pressure
     drives the body, its outer walls may not cross each other either. Elements whose Gauss points alone are kept from
-    turning inside out are checked by their corners.
+    turning inside out are checked at their corners.
 
     Args:
         cavities: whose walls do not touch anything in the model.
         outside: triangles of the boundary of solids (k, 3), which may contain those of the cavities.
-        cells: corners of such elements, shapes (m, 4).
+        cells: nodes of such elements, shapes (m, 4) or, with midside nodes as in `QuadraticTetrahedra`, (m, 10).
         driven: whether the pressure of a cavity drives the body.
     """
 
@@ -305,7 +333,9 @@ class ShapeCheck:
         cavities = {id(each): each for each in [*rows, *sealed] if isinstance(each, Cavity)}
         touching = model.contact is not None and model.contact.self_contact
         # A sliver turns inside out by less than its neighbours are strained.
-        cells = [_solid_cells(model.nodes, block.corners) for block in model.solids if block.points > 1]
+        cells = [
+            block.connectivity[_no_slivers(model.nodes, block.corners)] for block in model.solids if block.points > 1
+        ]
         if touching or not cavities:
             return cls([], np.empty((0, 3), dtype=np.int64), cells)
         driven = any(isinstance(each, Cavity) for each in model.constraints["a"])
@@ -323,8 +353,8 @@ class ShapeCheck:
                 "set_contact(settings=ContactSettings(self_contact=True))"
             )
         for cells in self._cells:
-            if (cell := _inside_out(x, cells)) >= 0:
-                place = np.round(x[cells[cell]].mean(axis=0), 4).tolist()
+            if (cell := (_inside_out if cells.shape[1] == 4 else _quadratic_inside_out)(x, cells)) >= 0:
+                place = np.round(x[cells[cell, :4]].mean(axis=0), 4).tolist()
                 return ImpossibleState(
                     f"an element near {place} m has turned inside out; refine the mesh there, or spread what loads it "
                     "over a radius"
@@ -350,11 +380,11 @@ def _boundary(block: Any) -> np.ndarray:
     return split_triangles(triangles, block.connectivity)
 
 
-def _solid_cells(nodes: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
-    """Return the tetrahedra (m, 4) that are no slivers: thicker than about a thirtieth of their edges."""
+def _no_slivers(nodes: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
+    """Return which tetrahedra (m, 4) are no slivers, but thicker than about a thirtieth of their edges, shape (m,)."""
     edges = nodes[tetrahedra[:, 1:]] - nodes[tetrahedra[:, :1]]
     longest = np.linalg.norm(edges, axis=2).max(axis=1)
-    return tetrahedra[np.linalg.det(edges) > 0.03 * longest**3]
+    return np.linalg.det(edges) > 0.03 * longest**3
 
 
 def check_cavities(cavities: Iterable[Constraint], x: np.ndarray) -> None:

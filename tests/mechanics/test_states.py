@@ -137,6 +137,24 @@ def test_a_quadratic_cell_that_is_inside_out_is_no_state():
     assert re.match(r"an element near .* m has turned inside out; refine the mesh there", str(check.problem(x)))
 
 
+def test_a_curved_cell_is_not_judged_by_the_tetrahedron_of_its_corners():
+    """A shear (x, y, z + q(x, y)) keeps every volume, and quadratic cells represent it exactly."""
+    corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.5, 0.5, 0.2]])
+    edges = [(0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)]
+    nodes = np.concatenate([corners, [corners[[i, j]].mean(axis=0) for i, j in edges]])
+    check = ShapeCheck([], np.empty((0, 3), dtype=np.int64), [np.arange(10)[None]])
+    bent = nodes.copy()
+    bent[:, 2] -= 8.0 * 0.2 * nodes[:, 0] * nodes[:, 1]
+    assert np.linalg.det(bent[1:4] - bent[0]) < 0.0 < np.linalg.det(nodes[1:4] - nodes[0])
+    assert check.problem(nodes) is None and check.problem(bent) is None
+    assert check.problem(bent * [1.0, 1.0, -1.0]) is not None  # mirrored
+    for node in range(4, 10):  # a midside node beyond a quarter of its edge
+        folded = nodes.copy()
+        i, j = edges[node - 4]
+        folded[node] = 0.8 * nodes[i] + 0.2 * nodes[j]
+        assert check.problem(folded) is not None
+
+
 def test_crossings_by_brute_force():
     """The search along one axis finds a crossing exactly where a comparison of all pairs does."""
     rng = np.random.default_rng(0)
