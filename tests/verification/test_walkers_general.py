@@ -43,7 +43,7 @@ def walk(seed, compiled, *, elements=4, control_steps=40, standing=4):
 
 def compare(seed, **options):
     """Return the largest distance of rows that are places, that of ``W`` relative to it, and the way of the trunk."""
-    (x, W, parts), (y, V, others) = (walk(seed, compiled, **options) for compiled in (True, False))
+    (x, W, parts), (y, V, _) = (walk(seed, compiled, **options) for compiled in (True, False))
     places = np.arange(0, x.shape[1], 4)
     size = np.sqrt(np.einsum("kii->ki", V))
     return (
@@ -51,15 +51,17 @@ def compare(seed, **options):
         (np.abs(W - V) / (size[:, :, None] * size[:, None])).max(axis=(1, 2)),
         float(np.linalg.norm(x[-1, 0] - x[0, 0])),
         parts,
-        others,
     )
 
 
 @pytest.mark.parametrize("seed", [0, 2])
 def test_walks_are_those_of_the_general_solver(seed):
-    """Of bodies and gaits without a time step that one of the solvers has to divide: divided ones are other steps."""
-    distance, compliance, way, parts, others = compare(seed, elements=2, control_steps=16)
-    assert parts == others == 1
+    """Of bodies and gaits without a time step that compiled code has to divide: divided ones are other steps.
+
+    The general solver takes some of them in increments, between which springs of friction must not slide.
+    """
+    distance, compliance, way, parts = compare(seed, elements=2, control_steps=16)
+    assert parts == 1
     assert distance.max() < 1e-6
     assert compliance.max() < 1e-6
     assert way > 1e-3
