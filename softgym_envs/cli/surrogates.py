@@ -107,9 +107,8 @@ def calibrate_trust(
     """Calibrate the uncertainty of a surrogate on FEM.
 
     Bodies are drawn in strata, such as inside the design box and at its corners. The uncertainty is scaled until it
-    covers 95 % of the errors under commands in each stratum. Then the limit of trust is lowered until at most 5 % of
-    the trusted states of each stratum, and of a search for the worst ones, are off by more than the goal tolerance. The
-    result is written to the card of the weights.
+    covers 95 % of the errors under commands in each stratum. Then the limit of trust is lowered until a search finds
+    no trusted state that is off by more than the goal tolerance. The result is written to the card of the weights.
     Bodies of learned parts have one command each, and no search.
     """
     from dataclasses import asdict

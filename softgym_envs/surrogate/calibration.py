@@ -4,11 +4,10 @@ Split conformal prediction (Vovk et al. 2005; Angelopoulos & Bates 2023, arXiv:2
 factors of `Calibration` are such that in each stratum of the calibration states the uncertainty bounds 95 % of the
 errors. The network is not trained again.
 
-A state is trusted if its uncertainty is below a limit. The limit is at most the robot's goal tolerance, and lower if
-more than 5 % of the trusted states of a stratum have errors above the tolerance. One of the strata are the states of a
-search for the worst trusted ones, in which finite elements judge states that gradients of the spread propose. A search
-proposes states just below the limit, so nothing has been searched below a lower one: searches are repeated, each below
-the limit that the last one left, until it stays.
+A state is trusted if its uncertainty is below a limit. The limit is at most the robot's goal tolerance, and lower if a
+search for the worst trusted states, in which finite elements judge states that gradients of the spread propose, finds
+errors above the tolerance. A search proposes states just below the limit, so nothing has been searched below a lower
+one: searches are repeated, each below the limit that the last one left, until one finds no error above the tolerance.
 
 Some commands have no equilibrium. An error exists only where there is one, so coverage is that of the other states; how
 many commands have none is reported for each stratum. The members of an ensemble may agree there, so the spread does not
@@ -39,7 +38,7 @@ from softgym_envs.surrogate.weight_files import load_model
 
 COVERAGE = 0.95
 SAFETY = 0.8
-"""The limit of trust, relative to the uncertainty above which too many states are wrong."""
+"""The limit of trust, relative to the smallest uncertainty with which an error above the tolerance was found."""
 
 FACTOR_OF = {
     "inside": "inside",
@@ -295,29 +294,18 @@ def usual_growth(model: SurrogateModel, states: StratifiedStates) -> float | Non
     return float(np.quantile(softness(model)(usual.design, usual.command), USUAL))
 
 
-def safe_limit(judged: Predictions, stratum: np.ndarray, tolerance: float) -> float:
-    """Return the largest uncertainty to be trusted: at most the tolerance [m].
+def safe_limit(judged: Predictions, tolerance: float) -> float:
+    """Return the largest uncertainty to be trusted: at most the tolerance [m], below that of all wrong states.
 
-    An uncertainty bounds 95 % of the errors, so of the trusted states of each stratum, those of a search included, at
-    most the other 5 % may be wrong: with an error above the tolerance, or without an equilibrium on FEM. States that
-    are not trusted for another reason than their uncertainty do not count.
+    A state is wrong if its error is above the tolerance or if it has no equilibrium on FEM. It does not count if it is
+    not trusted for another reason than its uncertainty.
 
     Args:
         judged: by a model without a limit.
-        stratum: of the states, shape (N,).
         tolerance: largest error of a trusted state [m].
     """
     wrong = judged.trusted & (~judged.found | (judged.error > tolerance))
-    limit = tolerance
-    for name in dict.fromkeys(stratum.tolist()):
-        rows = np.flatnonzero((stratum == name) & judged.trusted & (judged.uncertainty <= tolerance))
-        rows = rows[np.argsort(judged.uncertainty[rows])]
-        missed = np.cumsum(wrong[rows])
-        allowed = np.flatnonzero(missed <= (1.0 - COVERAGE) * np.arange(1, len(rows) + 1))
-        count = allowed[-1] + 1 if len(allowed) else 0
-        if count < len(rows):
-            limit = min(limit, SAFETY * float(judged.uncertainty[rows[count]]))
-    return limit
+    return min(tolerance, SAFETY * float(judged.uncertainty[wrong].min(initial=np.inf)))
 
 
 def calibrate(
@@ -361,13 +349,13 @@ def calibrate(
     calibration = fit_calibration(model, known)
     unlimited, everything = _calibrated(model, calibration), known
     limits: list[float] = []  # below which searches were made
-    limit = safe_limit(predict(unlimited, known), known.stratum, robot.goal_tolerance)
+    limit = safe_limit(predict(unlimited, known), robot.goal_tolerance)
     while adversarial_states and len(limits) < SEARCHES and (not limits or limit < (1.0 - ROUNDING) * limits[-1]):
         limits.append(limit)
         limited = _calibrated(model, calibration, limit)
         found_states = adversarial_search(limited, adversarial_states, states, seed, state_folder, len(limits), workers)
         everything = StratifiedStates.join([everything, found_states])
-        limit = safe_limit(predict(unlimited, everything), everything.stratum, robot.goal_tolerance)
+        limit = safe_limit(predict(unlimited, everything), robot.goal_tolerance)
     model = _calibrated(model, calibration, limit)
     found = report(model, everything)
     card_path = Path(folder) / "model.json"
@@ -401,7 +389,7 @@ def cross_validated(model: SurrogateModel, states: StratifiedStates, folds: int 
         left_out = states.body % folds == fold
         known = states.rows(~left_out)
         calibration = fit_calibration(model, known)
-        limit = safe_limit(predict(_calibrated(model, calibration), known), known.stratum, tolerance)
+        limit = safe_limit(predict(_calibrated(model, calibration), known), tolerance)
         parts.append(predict(_calibrated(model, calibration, limit), states.rows(left_out)))
         order.append(np.flatnonzero(left_out))
     back = np.argsort(np.concatenate(order))
