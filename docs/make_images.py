@@ -61,9 +61,11 @@ WIDTH, HEIGHT = 800, 520
 SHOWN = ("finger_reach", "trunk_track", "gripper_lift")
 """Environments of the animation of the home page."""
 FILM_SIZE, FILM_FRAMES = (360, 300), 30
-FILM_AGENTS = {"finger_grasp": "force", "gripper_lift": "close", "tetrapod_carry": "tetrapod_carry"}
+FILM_AGENTS = {
+    "finger_grasp": "force", "gripper_lift": "close", "quadruped_walk": "gait", "tetrapod_carry": "tetrapod_carry",
+}  # fmt: skip
 """Agents of the films of environments, where it is not the inverse QP."""
-FILM_STEPS = {"gripper_lift": 50, "tetrapod_carry": 60}
+FILM_STEPS = {"gripper_lift": 50, "quadruped_walk": 100, "tetrapod_carry": 60}
 OPTIONS: dict[str, dict[str, Any]] = {
     "finger_grasp": {"backend": "fem", "robot_options": {"object": "hexagon"}},  # easier to see than a plane
     "modular_reach": {"backend": "fem", "robot_options": {"body": "solid"}},  # superelements are drawn as bars

@@ -45,8 +45,10 @@ class GaitConfig(Config):
 class GaitLearner(Learner):
     """Commands that repeat, improved along the gradient of the way ahead (+x).
 
-    It begins near the reference gait of the robot. A policy adds up a bias that depends on the time in the period and a
-    fixed pull towards it, so it acts as any other policy does, and is limited as these are.
+    It begins near the reference gait of the robot. Where the robot has two equal sides, these do the same in turns,
+    half a period apart, as in the reference gait: what repeats like that goes straight. A policy adds up a bias that
+    depends on the time in the period and a fixed pull towards it, so it acts as any other policy does, and is limited
+    as these are.
 
     Args:
         config: configuration of the training; the environment has one body, and ``num_envs`` has no effect.
@@ -88,7 +90,7 @@ class GaitLearner(Learner):
         # What a policy aims at in a step is where it should be after it.
         noise = np.random.default_rng(config.seed).normal(size=resampled.shape)
         start = np.roll((resampled - self._middle) / self._half, -1, axis=0)
-        self.gait = np.clip(start + config.settings.spread * noise, -1.0, 1.0)
+        self.gait = np.clip(start + config.settings.spread * self._straight(noise), -1.0, 1.0)
         self.step = 0
         self.ways: list[float] = []
         self._mean, self._square = np.zeros_like(self.gait), np.zeros_like(self.gait)
@@ -149,7 +151,14 @@ class GaitLearner(Learner):
             carried = carried + by_command[k]
             gradient[k % settings.period] += carried * pull[k]
             carried = carried * follow[k]
-        return float(way[0]), gradient
+        return float(way[0]), self._straight(gradient)
+
+    def _straight(self, change: np.ndarray) -> np.ndarray:
+        """Return the part of a change of the gait (p, n_a) after which both sides still do the same in turns."""
+        mirror, half = self.env.robot.mirrored_actuators, self.config.settings.period // 2
+        if mirror is None or self.config.settings.period % 2:
+            return change
+        return 0.5 * (change + np.roll(change, half, axis=0)[:, list(mirror)])
 
     def commands(self, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the commands of the first control steps from rest, as the policy gives them.

@@ -158,9 +158,12 @@ def check_command(robot: Robot, command: object, mode: str) -> np.ndarray:
     """Return a command as an array (n_a,).
 
     Raises:
-        ValueError: unless it is one finite number for each actuator; also for a displacement so far beyond the range of
-            its actuator, or an effort so far beyond what is typical of it, that its unit is probably wrong.
+        ValueError: for an unknown mode, or unless it is one finite number for each actuator; also for a displacement
+            so far beyond the range of its actuator, or an effort so far beyond what is typical of it, that its unit is
+            probably wrong.
     """
+    if mode not in ("displacement", "effort"):
+        raise ValueError(f"mode = {mode!r} is unknown; allowed: 'displacement', 'effort'")
     array = check_numbers("command", command, len(robot.actuators))
     if mode == "effort":
         for actuator, value, typical in zip(robot.actuators, array.tolist(), robot.effort_scale.tolist(), strict=True):

@@ -105,6 +105,7 @@ class Robot(ABC):
         learning: what surrogates know of the robot before they learn it.
         sensing: sensors inside the body; none by default.
         view: from where pictures show it.
+        mirrored_actuators: for each actuator, that on the other side of the body; None if it has no equal sides.
         made_of_beams: bodies are quadratic beams and rigid parts, moved by servos or chambers; finite elements step
             many of them at once.
         body_frame: row of the model with the origin of the frame that carries the body, of robots that move about; its
@@ -130,6 +131,7 @@ class Robot(ABC):
     learning: Learning = Learning()
     sensing: Sensing = Sensing()
     view: View = View()
+    mirrored_actuators: tuple[int, ...] | None = None
     made_of_beams: bool = False
     body_frame: int | None = None
     backends: Mapping[str, str] = {}

@@ -80,9 +80,19 @@ class View:
 
     Attributes:
         axes: coordinates towards the viewer, to the right and up: (0, 1, 2), (1, 2, 0) or (2, 0, 1).
+        turned: by a quarter about the vertical, so that the first of the axes points to the right instead.
         at_rest: pictures are framed by the robot at rest, since many commands have no static equilibrium, as with an
             object that can fall; otherwise also by where its actuators can take it.
+        way: how far it goes along x in an episode, which pictures are to show too [sizes of the robot].
     """
 
     axes: tuple[int, int, int] = (0, 1, 2)
+    turned: bool = False
     at_rest: bool = False
+    way: float = 0.0
+
+    @property
+    def directions(self) -> np.ndarray:
+        """Directions towards the viewer, to the right and up, as rows, shape (3, 3)."""
+        towards, right, up = np.eye(3)[list(self.axes)]
+        return np.stack([-right, towards, up] if self.turned else [towards, right, up])

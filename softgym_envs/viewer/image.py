@@ -137,7 +137,10 @@ class ImageRenderer:
             lines = cable_lines(model, x, rest, stub=STUB * self.robot.size)
             pulled = [_pulled(line, self.robot.upper[row]) for row, line in lines.items()]
             seen = [BodySurface(model).points(x), *pulled, _reached(self.robot, rest)]
-            seen += [points for points, _ in obstacle_skins(model, self.robot.size)]
+            if way := self.robot.view.way * self.robot.size:
+                seen += [points + [way, 0.0, 0.0] for points in seen]
+            else:
+                seen += [points for points, _ in obstacle_skins(model, self.robot)]
             for other in {self.robot.design_space.complete(body) for body in self._framed} - {baseline}:
                 shape, nodes = BodySurface(self.shapes.load(other)), self.shapes.rest(other).nodes
                 assert nodes is not None

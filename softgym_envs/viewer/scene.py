@@ -171,7 +171,7 @@ class Scene:
         self.robot = robot
         self._length = robot.size
         self._line = max(1.0, size[1] / 480.0)
-        self._axes = list(robot.view.axes)
+        self._axes = robot.view.directions
         cloud = self._seen(cloud)
         self._open_window(size, window)
         self._place_camera(size, cloud)
@@ -195,7 +195,7 @@ class Scene:
 
     def _seen(self, points: np.ndarray) -> np.ndarray:
         """Return points [m] (n, 3) in the axes of the picture: towards the camera, to the right, up."""
-        return points[:, self._axes]
+        return points @ self._axes.T
 
     # -- set-up -----------------------------------------------------------------------------------------------------
 
@@ -304,7 +304,7 @@ class Scene:
             self._shadow.show(self._flat)
             self._seams = _line_mesh(np.zeros_like(self._surface.shape(x)), self._surface.edges)
             self._edges.show(self._seams)
-            skins = [(self._seen(points), faces) for points, faces in obstacle_skins(model, self._length)]
+            skins = [(self._seen(points), faces) for points, faces in obstacle_skins(model, self.robot)]
             parts = [pyvista.PolyData.from_regular_faces(*skin) for skin in skins]
             self._obstacles.show(pyvista.merge(parts) if parts else None)
         points = self._seen(self._surface.points(x))
@@ -331,8 +331,7 @@ class Scene:
     def set_state(self, x: np.ndarray, state: State) -> None:
         """Draw cables and effectors of the current body at node positions [m] (n, 3) in a state."""
         assert self._model is not None
-        side = np.zeros(3)
-        side[self._axes] = self._side
+        side = self._side @ self._axes
         lines = cable_lines(self._model, x, state, stub=STUB * self._length, side=tuple(side))
         for row in self._cables.keys() - lines.keys():
             self._cables[row].show(None)
@@ -406,14 +405,15 @@ def _surface_mesh(surface: BodySurface) -> pyvista.PolyData:
     return pyvista.PolyData.from_regular_faces(np.zeros((len(surface.nodes), 3)), surface.triangles)
 
 
-def obstacle_skins(model: MechanicalModel, size: float) -> list[tuple[np.ndarray, np.ndarray]]:
+def obstacle_skins(model: MechanicalModel, robot: Robot) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return vertices [m] and triangles of the obstacles that stand still; those that move are skins of the body.
 
     Args:
         model: body with its contacts.
-        size: of the robot [m]; an infinite obstacle is shown up to three quarters of it to each side.
+        robot: an infinite obstacle is shown up to three quarters of its size to each side, and under its way.
     """
-    return [o.skin(0.75 * size) for o in (model.contact.obstacles if model.contact else ()) if o.frame is None]
+    half = (0.75 + robot.view.way) * robot.size
+    return [o.skin(half) for o in (model.contact.obstacles if model.contact else ()) if o.frame is None]
 
 
 def _move(mesh: pyvista.PolyData, points: np.ndarray, normals: np.ndarray | None = None) -> None:

@@ -37,9 +37,16 @@ def test_the_gradient_is_that_of_the_way(monkeypatch):
 
     rng = np.random.default_rng(0)
     for _ in range(3):
-        direction = rng.normal(size=start.shape)
+        direction = learner._straight(rng.normal(size=start.shape))
         difference = (value(start + 1e-6 * direction) - value(start - 1e-6 * direction)) / 2e-6
         assert (gradient * direction).sum() == pytest.approx(difference, rel=1e-4)
+
+
+def test_both_sides_do_the_same_in_turns():
+    learner = GaitLearner(config(90, seed=1))
+    learner.learn(90, lambda count: None)
+    np.testing.assert_allclose(learner.gait, np.roll(learner.gait, 5, axis=0)[:, [2, 3, 0, 1, 6, 7, 4, 5]], atol=1e-12)
+    assert len(learner.ways) == 3 and learner.ways[-1] > learner.ways[0]
 
 
 def test_the_environment_follows_the_commands_of_the_learner():

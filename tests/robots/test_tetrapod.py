@@ -13,7 +13,7 @@ from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.errors import ConvergenceError, DesignError
 from softgym_envs.mechanics.elements.beams import Beam
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.robots.tetrapod import CENTRE_MASS, MESHES
+from softgym_envs.robots.tetrapod import CENTRE_MASS, MESHES, printed_leg
 from softgym_envs.surrogate.domain import distrust_text
 from tests.verification import robot_dynamics as cases
 
@@ -205,7 +205,9 @@ def test_unevenly_curved_legs_hang_differently():
 
 def test_printed_shape_has_its_length_and_curvature(robot):
     design = robot.design_space.complete({"curvature_1": 8.0, "curvature_2": -3.0, "curvature_3": 5.0})
-    printed = robot._printed(np.zeros(3), np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]), design)
+    printed = printed_leg([8.0, -3.0, 5.0], design["leg_length"], 2 * robot.elements + 1)
+    # A leg leaves its root downwards and bends outwards, along x.
+    printed = printed @ np.column_stack([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]).T
     assert np.linalg.norm(np.diff(printed[:, 0], axis=0), axis=1).sum() == pytest.approx(0.205, rel=2e-3)
     angles = np.unwrap(np.arctan2(-printed[:, 1, 0], -printed[:, 1, 2]))
     s = np.linspace(0.0, 0.205, len(angles))

@@ -358,8 +358,9 @@ def _own_masses(matrix: csr_matrix, frames: Frames, count: int) -> csr_matrix:
     found, used = csr_matrix(follow.T @ matrix @ follow), (_pattern(follow), _pattern(matrix))
     layout = csr_matrix(used[0].T @ used[1] @ used[0])
     layout.sort_indices()
-    rows = np.repeat(np.arange(count), np.diff(layout.indptr))
-    layout.data = np.asarray(found[rows, layout.indices]).ravel()
+    if layout.nnz:  # scipy finds no entries of type float where there are none
+        rows = np.repeat(np.arange(count), np.diff(layout.indptr))
+        layout.data = np.asarray(found[rows, layout.indices]).ravel()
     return layout
 
 
