@@ -40,6 +40,22 @@ if TYPE_CHECKING:
     from softgym_envs.mechanics.solvers.rollout import Rollout
 
 
+def _drifts(model: MechanicalModel) -> bool:
+    """Whether nothing holds a body: moved anywhere, it stores no energy, and neither actuators nor bonds notice."""
+    moved = np.ones(len(model.nodes), bool)
+    moved[(model.frames.rows[:, None] + np.arange(1, 4)).ravel()] = False  # directors
+    moved[model.frames.carried[model.frames.moves != 1.0]] = False
+    held = [constraint for group in "ab" for constraint in model.constraints[group]]
+    size = float(np.ptp(model.nodes, axis=0).max()) or 1.0
+    for axis in np.eye(3):
+        x = model.nodes + 1e-3 * size * axis * moved[:, None]
+        if abs(model.elastic_energy(x) - model.elastic_energy(model.nodes)) > 1e-12 or any(
+            np.abs(constraint.value(x) - constraint.value(model.nodes)).max() > 1e-6 * size for constraint in held
+        ):
+            return False
+    return True
+
+
 def _relax_dynamically(model: MechanicalModel, statics: Statics, command: np.ndarray) -> Equilibrium:
     """Find an equilibrium that Newton's method misses, by a slow, heavily damped motion towards it."""
     from softgym_envs.mechanics.solvers.dynamics import Dynamics
@@ -145,7 +161,7 @@ class FEMBackend(Backend):
             self._set_compliance(model)
             statics = self._solver(model)
             zero = np.zeros(len(self.robot.actuators))
-            if model.floating and model.contact is None and not model.constraints["b"]:
+            if model.floating and model.contact is None and _drifts(model):
                 rest = self._afloat(model, zero)
             else:
                 try:
