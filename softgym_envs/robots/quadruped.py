@@ -63,7 +63,7 @@ class Quadruped(Robot):
     goal_axes = np.array([1.0, 1.0, 0.0])
     goal_tolerance = 0.01
     mirrored_actuators = (2, 3, 0, 1, 6, 7, 4, 5)
-    view = View(turned=True, at_rest=True, way=4.0)
+    view = View(turned=True, at_rest=True, way=2.0)
     workspace_scale = 0.04
 
     def __init__(
