@@ -163,7 +163,8 @@ def test_vector_environments_walk_alike():
         ({"slip": -1.0}, "slip = -1.0 must be finite and not negative"),
         ({"payload": -0.1}, "payload = -0.1 kg must be"),
         ({"push": -1.0}, "push = -1.0"),
-        ({"push_steps": 0}, "push_steps = 0 must be at least 1"),
+        ({"push_steps": 0}, "push_steps = 0 is out of bounds; allowed: 1 to 99 control steps"),
+        ({"push_steps": 100}, "push_steps = 100 is out of bounds"),
     ],
 )
 def test_wrong_options(options, words):

@@ -161,8 +161,10 @@ class Walk(Task):
         ):
             if not 0.0 <= value < np.inf:
                 raise ValueError(f"{name} = {value}{unit} must be finite and not negative")
-        if push_steps < 1:
-            raise ValueError(f"push_steps = {push_steps} must be at least 1")
+        if not 1 <= push_steps < self.max_episode_steps:
+            raise ValueError(
+                f"push_steps = {push_steps} is out of bounds; allowed: 1 to {self.max_episode_steps - 1} control steps"
+            )
         self.pace, self.slip, self.drift, self.work = pace, slip, drift, work
         check_force(push, "push", robot)
         check_force(9.81 * payload, "weight of the payload", robot)
