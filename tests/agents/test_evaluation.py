@@ -79,13 +79,14 @@ def test_largest_efforts_are_those_of_any_actuator_in_any_step(backend):
 
 
 def test_untrusted_states_are_counted():
-    """A policy that folds legs on the published mesh, in a batch; random actions alone."""
-    environment = EnvironmentConfig(id="SoftGym/TetrapodCarry-v0")
-    goals = sample_goals(environment, 1, seed=0)
-    folding = evaluate("tetrapod_carry_empty", environment, goals)
+    """An inverse QP that folds legs of the published mesh under a payload, in a batch and alone; random actions."""
+    options = {"mesh": "published", "payload": 1.0, "servo_range": 0.5 * np.pi}
+    environment = EnvironmentConfig(id="SoftGym/TetrapodCarry-v0", robot_options=options)
+    goals = sample_goals(environment, 2, seed=0)
+    folding = evaluate("qp", environment, goals)
     assert 0.2 < folding.untrusted[0] < 1.0
     env = environment.make()
-    act = make_agent("tetrapod_carry_empty")
+    act = make_agent("qp")
     observation, _ = env.reset(seed=0)
     distrusted = []
     for _ in range(100):
