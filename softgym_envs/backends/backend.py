@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -119,6 +119,37 @@ class PointForce:
     def __post_init__(self) -> None:
         for name in ("point", "force"):
             object.__setattr__(self, name, check_numbers(f"{name} of a touch", getattr(self, name), 3))
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Where a body stands, if not as its robot says: what an episode can draw without another body.
+
+    On a slope that rises by an angle ``a`` along x, gravity is ``9.81 (-sin a, 0, -cos a)``: the axes are those of the
+    slope, and obstacles keep their places.
+
+    Attributes:
+        friction: coefficient of friction of all obstacles; None: their own.
+        gravity: acceleration [m/s2], shape (3,); None: that of the robot.
+
+    Raises:
+        ValueError: for a negative coefficient, or values that are not finite or in another unit.
+    """
+
+    friction: float | None = None
+    gravity: Sequence[float] | None = None
+
+    def __post_init__(self) -> None:
+        if self.friction is not None:
+            friction = float(check_numbers("friction of the ground", [self.friction], 1)[0])
+            if friction < 0.0:
+                raise ValueError(f"friction of the ground = {friction} must not be negative")
+            check_quantity("friction", friction, "friction of the ground")
+            object.__setattr__(self, "friction", friction)
+        if self.gravity is not None:
+            gravity = check_numbers("gravity", self.gravity, 3)
+            check_quantity("gravity", np.linalg.norm(gravity), "length of gravity")
+            object.__setattr__(self, "gravity", tuple(gravity.tolist()))
 
 
 @dataclass(frozen=True)
@@ -304,6 +335,15 @@ class Backend(ABC):
                 no forces.
         """
         raise ValueError(f"{type(self).__name__} takes no forces")
+
+    def stand_on(self, ground: Ground) -> State:
+        """Go to the rest equilibrium on another ground, which stays that of all bodies until the next call.
+
+        Raises:
+            ConvergenceError: if the body does not stand there; ground and state are kept.
+            ValueError: if the backend computes no contacts.
+        """
+        raise ValueError(f"{type(self).__name__} has no ground")
 
     def contact_model(self, *, friction: bool = False) -> CondensedModel:
         """Return the condensed model at the current state, with openings of contacts as further rows ``c``.

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from softgym_envs.backends.backend import PointForce, State
+from softgym_envs.backends.backend import Ground, PointForce, State
 from softgym_envs.errors import InfeasibleDesign
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.robots.base import Robot
@@ -113,6 +113,10 @@ class BatchBackend(ABC):
     def touch(self, loads: Sequence[PointForce | None]) -> None:
         """Touch the bodies from the next `step` on, one load or None for each; `rest` ends a touch."""
         raise ValueError(f"{type(self).__name__} takes no forces")
+
+    def stand_on(self, index: np.ndarray, grounds: Sequence[Ground]) -> None:
+        """Put rows at rest on other grounds, as `Backend.stand_on`."""
+        raise ValueError(f"{type(self).__name__} has no ground")
 
     def set_cables(self, index: np.ndarray, friction: Sequence[float], compliance: Sequence[Any]) -> None:
         """Set `Backend.cable_friction` and `Backend.cable_compliance` of rows at rest.

@@ -10,6 +10,7 @@ import numpy as np
 
 from softgym_envs.backends.backend import (
     Backend,
+    Ground,
     PointForce,
     Snapshot,
     State,
@@ -34,7 +35,7 @@ from softgym_envs.surrogate.domain import FOLDED, LOADED, SOFT, SPREAD
 from softgym_envs.wording import counted
 
 if TYPE_CHECKING:
-    from softgym_envs.mechanics.contact.contact import ContactMemory
+    from softgym_envs.mechanics.contact.contact import Contact, ContactMemory
     from softgym_envs.mechanics.solvers.beam_motion import BeamMotion
     from softgym_envs.mechanics.solvers.dynamics import Dynamics, Motion
     from softgym_envs.mechanics.solvers.rollout import Rollout
@@ -133,6 +134,7 @@ class FEMBackend(Backend):
         self._limited = bool(np.isfinite(self.largest_efforts).any())
         self._friction = self._checked_friction(cable_friction)
         self._compliance = self._checked_compliance(cable_compliance)
+        self._ground = Ground()
         self.design = None  # type: ignore[assignment]  # until the first reset
         self.reset(robot.design_space.complete(design))
 
@@ -159,23 +161,51 @@ class FEMBackend(Backend):
             model = self._build(complete)
             self._set_friction(model)
             self._set_compliance(model)
-            statics = self._solver(model)
-            zero = np.zeros(len(self.robot.actuators))
-            if model.floating and model.contact is None and _drifts(model):
-                rest = self._afloat(model, zero)
-            else:
-                try:
-                    rest = statics.solve(zero)
-                except ConvergenceError:
-                    rest = _relax_dynamically(model, statics, zero)
-            self._dynamics = self._mover(model) if self.moving else None
-            self.model, self._statics, self.design = model, statics, complete
-            self._rest = self._state(rest, zero, still=True)
-            self._own_loads = model.nodal_loads.copy()
+            own, loads = (model.contact, model.gravity.tolist()), model.nodal_loads.copy()
+            self._stand(self._ground, model, own)
+            self._settle(model)
+            self.design, self._own, self._own_loads = complete, own, loads
         self.touch(None)
         self.restore(self._rest)
         self._mode = "displacement"  # mode of the current state's command
         return self.state
+
+    def _settle(self, model: MechanicalModel) -> None:
+        """Find the state at rest of a model, and take over the model and its solvers."""
+        statics, zero = self._solver(model), np.zeros(len(self.robot.actuators))
+        if model.floating and model.contact is None and _drifts(model):
+            rest = self._afloat(model, zero)
+        else:
+            try:
+                rest = statics.solve(zero)
+            except ConvergenceError:
+                rest = _relax_dynamically(model, statics, zero)
+        self._dynamics = self._mover(model) if self.moving else None
+        self.model, self._statics = model, statics
+        self._rest = self._state(rest, zero, still=True)
+
+    def stand_on(self, ground: Ground) -> State:
+        if not self.robot.may_touch:
+            raise ValueError(f"robot '{self.robot.name}' touches nothing, so it has no ground")
+        if ground != self._ground:
+            self.touch(None)
+            try:
+                self._stand(ground, self.model, self._own)
+                self._settle(self.model)
+            except BaseException:
+                self._stand(self._ground, self.model, self._own)
+                raise
+            self._ground = ground
+        return self.reset()
+
+    @staticmethod
+    def _stand(ground: Ground, model: MechanicalModel, own: tuple[Contact | None, Sequence[float]]) -> None:
+        """Change gravity and the friction of the obstacles of a model, whose own contact and gravity are given."""
+        contact, gravity = own
+        model.set_gravity(gravity if ground.gravity is None else ground.gravity)
+        model.contact = contact
+        if contact is not None and ground.friction is not None:
+            model.contact = contact.with_friction(ground.friction)
 
     def _mover(self, model: MechanicalModel) -> Dynamics:
         from softgym_envs.mechanics.solvers.dynamics import Dynamics
@@ -419,13 +449,16 @@ class FEMBackend(Backend):
             memory=memory,
         )
 
-    def _extra_state(self) -> tuple[str, tuple | None, PointForce | None]:
-        return self._mode, self._motion, self._touch
+    def _extra_state(self) -> tuple[str, tuple | None, PointForce | None, Ground]:
+        return self._mode, self._motion, self._touch, self._ground
 
     def _resume(self, snapshot: Snapshot) -> None:
+        self._mode, motion, touch, ground = snapshot.extra
+        if ground != self._ground:
+            self.stand_on(ground)
         self.reset(snapshot.design)
         self.state = snapshot.state
-        self._mode, motion, touch = snapshot.extra
+        self._mode = snapshot.extra[0]  # a reset has changed it
         self.touch(touch)
         self._go_back(motion)
 

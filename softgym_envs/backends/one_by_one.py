@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from softgym_envs.backends.backend import Backend, PointForce, Snapshot, State
+from softgym_envs.backends.backend import Backend, Ground, PointForce, Snapshot, State
 from softgym_envs.backends.batch import BatchBackend, BatchState, condensed_gradient
 from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
@@ -85,6 +85,10 @@ class OneByOne(BatchBackend):
     def touch(self, loads: Sequence[PointForce | None]) -> None:
         for owner, load in zip(self.owners, loads, strict=True):
             owner.touch(load)
+
+    def stand_on(self, index: np.ndarray, grounds: Sequence[Ground]) -> None:
+        for i, ground in zip(index.tolist(), grounds, strict=True):
+            self.owners[i].stand_on(ground)
 
     def set_cables(self, index: np.ndarray, friction: Sequence[float], compliance: Sequence[Any]) -> None:
         for i, *values in zip(index.tolist(), friction, compliance, strict=True):

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from gymnasium.utils.seeding import np_random
 
-from softgym_envs.backends.backend import Snapshot, State
+from softgym_envs.backends.backend import Ground, Snapshot, State
 from softgym_envs.backends.batch import BatchState
 from softgym_envs.envs.options import Setup, task_by_row
 from softgym_envs.envs.plant import Plant, Sensed, play, sensed, stiffened
@@ -103,7 +103,8 @@ class Episodes:
         self._alone, self._only = alone, 0 if alone else slice(None)
         self._reads_states = bool(task_by_row(task))
         # What a task remembers of an episode is in the task itself.
-        self._remembers = self._reads_states or type(task).begin is not Task.begin
+        self._draws_ground = type(task).draw_ground is not Task.draw_ground
+        self._remembers = self._reads_states or self._draws_ground or type(task).begin is not Task.begin
         copies = [copy.deepcopy(task, {id(self.robot): self.robot}) for _ in range((count - 1) * self._remembers)]
         self._tasks = [task, *copies] if self._remembers else [task] * count
         self._records = type(task).record is not Task.record
@@ -190,6 +191,9 @@ class Episodes:
             self.paths = np.pad(self.paths, ((0, 0), (0, missing), (0, 0)))
         self.paths[index, : paths.shape[1]] = paths
         self.counts[index] = paths.shape[1]
+        if self._draws_ground:
+            grounds = [self._tasks[i].draw_ground(self._generator(i)) for i in index.tolist()]
+            self.backend.stand_on(index, [Ground() if each is None else each for each in grounds])
         if self._remembers:
             for i in index.tolist():
                 own, random = self._tasks[i], self._generator(i)

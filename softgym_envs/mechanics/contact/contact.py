@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -196,6 +197,13 @@ class Contact:
                     f"obstacle '{each.name}' stands for the skin of its frame in self-contact and cannot touch meshed "
                     "obstacles: make it a MeshObstacle, or leave self-contact out"
                 )
+
+    def with_friction(self, friction: float) -> Contact:
+        """Return this contact with another coefficient of friction of all obstacles."""
+        made, own = copy.copy(self), self.surfaces
+        made.obstacles = tuple(replace(each, friction=friction) for each in self.obstacles)
+        made.surfaces = replace(own, friction=np.where(np.isnan(own.friction), np.nan, friction))
+        return made
 
     @property
     def meshes(self) -> tuple[MeshObstacle, ...]:
