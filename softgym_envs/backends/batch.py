@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -15,8 +15,45 @@ from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.robots.base import Robot
 
 
+class Rows:
+    """A dataclass of arrays, whose first axis counts the rows."""
+
+    __slots__ = ()
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    def _each(self, function: Callable[..., np.ndarray], *others: Self) -> Self:
+        """Return what a function makes of each array, and of the same one of others."""
+        return type(self)(*(function(*(getattr(one, n) for one in (self, *others))) for n in self.__dataclass_fields__))
+
+    def repeat(self, count: int) -> Self:
+        """Return ``count`` copies of the only row."""
+        return self._each(lambda a: np.repeat(a, count, axis=0))
+
+    def rows(self, index: np.ndarray) -> Self:
+        """Return copies of some rows."""
+        return self._each(lambda a: a[index])
+
+    def replaced(self, index: np.ndarray, new: Self) -> Self:
+        """Return a copy in which some rows are new."""
+
+        def put(old: np.ndarray, new: np.ndarray) -> np.ndarray:
+            copy = old.copy()
+            copy[index] = new
+            return copy
+
+        return self._each(put, new)
+
+    def where(self, found: np.ndarray, old: Self) -> Self:
+        """Return the rows that are found (B,), and those of ``old`` in place of the others."""
+
+        def choose(new: np.ndarray, old: np.ndarray) -> np.ndarray:
+            return np.where(found.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
+
+        return self._each(choose, old)
+
+
 @dataclass(slots=True)  # not frozen: that would triple the time to make one
-class BatchState:
+class BatchState(Rows):
     """States of a batch of B bodies.
 
     Attributes:
@@ -41,27 +78,6 @@ class BatchState:
     def trusted(self) -> np.ndarray:
         """Whether the model may be trusted, shape (B,)."""
         return self.distrust == 0
-
-    def repeat(self, count: int) -> BatchState:
-        """Return ``count`` copies of the state of one row."""
-        return BatchState(*(np.repeat(getattr(self, name), count, axis=0) for name in _FIELDS))
-
-    def rows(self, index: np.ndarray) -> BatchState:
-        """Return copies of the states of some rows."""
-        return BatchState(*(getattr(self, name)[index] for name in _FIELDS))
-
-    def put(self, index: np.ndarray, new: BatchState) -> None:
-        """Replace the states of some rows."""
-        for name in _FIELDS:
-            getattr(self, name)[index] = getattr(new, name)
-
-    def where(self, found: np.ndarray, old: BatchState) -> BatchState:
-        """Return the states of this batch in the rows that are found, those of ``old`` in the others."""
-        pairs = ((getattr(self, name), getattr(old, name)) for name in _FIELDS)
-        return BatchState(*(np.where(found if a.ndim == 1 else found[:, None], a, b) for a, b in pairs))
-
-
-_FIELDS = tuple(field.name for field in fields(BatchState))
 
 
 class BatchBackend(ABC):

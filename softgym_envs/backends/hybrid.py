@@ -7,6 +7,7 @@ the less often finite elements are needed.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,7 +16,8 @@ import numpy as np
 
 from softgym_envs.backends.backend import Backend, Snapshot, State, refuse_force
 from softgym_envs.backends.fem import FEMBackend
-from softgym_envs.backends.surrogate import SurrogateBody
+from softgym_envs.backends.surrogate import SurrogateBackend
+from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError, DataError
 from softgym_envs.mechanics.solvers.complementarity import solve_complementarity
 from softgym_envs.mechanics.solvers.equilibrium import RowLayout
@@ -153,11 +155,7 @@ class HybridBackend(Backend):
             self._learn()
             changed = True
         if changed:
-            body = SurrogateBody(self.model, complete)
-            try:
-                rest = body.rest()
-            except ConvergenceError:
-                rest = None
+            body, rest = self._learned_body(complete)
             if rest is None or not rest.trusted:
                 rest = self._build_fem(complete)
             self._body, self.design, self._rest = body, complete, rest
@@ -166,10 +164,11 @@ class HybridBackend(Backend):
 
     def step(self, command: np.ndarray, mode: str = "displacement", *, force: np.ndarray | None = None) -> State:
         refuse_force(force)
-        try:
-            found = self._body.solve(command, mode, self.state)
-        except ConvergenceError:
-            found = None
+        found = None
+        if self._body is not None:
+            self._body.restore(self.state)
+            with suppress(ConvergenceError):
+                found = self._body.probe(command, mode)
         self.calls += 1
         # The learned model does not know the largest efforts.
         if found is None or not found.trusted or (np.abs(found.effort) > self._max_effort).any():
@@ -179,6 +178,14 @@ class HybridBackend(Backend):
 
     def restore(self, state: State) -> None:
         self.state = state
+
+    def _learned_body(self, design: Design) -> tuple[SurrogateBackend | None, State | None]:
+        """Return a body on the present learned model, with its state at rest; None where it finds none."""
+        try:
+            body = SurrogateBackend(self.robot, design, self.model)
+        except ConvergenceError:
+            return None, None
+        return body, body.state
 
     def _extra_state(self) -> _Episode:
         # Without the kept states: a copy collects its own for the ensemble to learn.
@@ -309,7 +316,7 @@ class HybridBackend(Backend):
         """Use another model, for the current body too."""
         self.model = model
         if self.design is not None:
-            self._body = SurrogateBody(model, self.design)
+            self._body, _ = self._learned_body(self.design)
 
     def _load_learned(self) -> None:
         """Continue from the states of an earlier run: load the weights that learned them, or train on them now."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -19,9 +19,8 @@ from softgym_envs.backends.backend import (
     refuse_force,
 )
 from softgym_envs.backends.batch import BatchBackend, BatchState
-from softgym_envs.backends.surrogate_motion import MotionState, SurrogateMotion
+from softgym_envs.backends.surrogate_motion import SurrogateMotion
 from softgym_envs.backends.time_steps import TimeSteps, check_still
-from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.robots.base import Robot
@@ -32,6 +31,8 @@ from softgym_envs.surrogate.pretrained import pretrained_folder, standalone_mode
 #: A search ends when its next step is below this [quarter of the actuator range]: 3e-7 m for a cable of 20 mm. Single
 #: precision does not allow much less.
 TOLERANCE = 5e-5
+
+_ONLY = np.zeros(1, dtype=np.int64)
 
 
 def solve_efforts(model: SurrogateModel, context: Context, effort: np.ndarray, start: np.ndarray) -> BatchState:
@@ -140,136 +141,24 @@ def displacement_gradient(
     return held, commanded
 
 
-class SurrogateBody:
-    """One body on a learned model: its states at rest and under commands.
-
-    Args:
-        model: the learned model.
-        design: the body.
-        motion: what steps it in time; None in statics.
-        effectors: coordinates of effectors that states have, the first ones of the model; default all.
-        touch: values of the model's load variables; default none act.
-    """
-
-    def __init__(
-        self,
-        model: SurrogateModel,
-        design: Design,
-        motion: SurrogateMotion | None = None,
-        *,
-        effectors: int | None = None,
-        touch: Mapping[str, float] | None = None,
-    ) -> None:
-        self.model, self.design, self._motion = model, design, motion
-        space = model.robot.design_space
-        # Loads beyond those that were learned are judged as outside the box, not refused.
-        values = np.array([{**space.baseline, **design, **(touch or {})}[name] for name in space.names])
-        self._context, self._unilateral = model.context(values[None]), model.robot.unilateral
-        self._effectors = model.effectors if effectors is None else effectors
-        self._inertia = np.zeros((1, 0)) if motion is None else motion.inertia.body(design.array[None])
-
-    def rest(self) -> State:
-        """Return the state at rest.
-
-        Raises:
-            ConvergenceError: if the search does not find it.
-        """
-        found = rest_state(self.model, self._context, self._unilateral)
-        if not found.converged[0]:
-            raise ConvergenceError(f"the surrogate finds no equilibrium at rest of design {self.design}")
-        return self._state(np.zeros(self.model.count), found)
-
-    def solve(self, command: np.ndarray, mode: str, start: State) -> State:
-        """Return the state under a command; the search begins at ``start``.
-
-        Raises:
-            ConvergenceError: if the search does not find it.
-            ValueError: for a malformed command.
-        """
-        command = check_command(self.model.robot, command, mode)
-        place = start.displacement[None]
-        if mode == "displacement":
-            found = solve_displacements(
-                self.model, self._context, command[None], place, self._unilateral, start.slack[None]
-            )
-        elif mode == "effort":
-            if (command[self._unilateral] < 0.0).any():
-                raise ValueError(f"efforts {command.tolist()} must not be negative: the actuators cannot push")
-            found = solve_efforts(self.model, self._context, command[None], place)
-        else:
-            raise ValueError(f"mode = {mode!r} is unknown; allowed: 'displacement', 'effort'")
-        if not found.converged[0]:
-            raise ConvergenceError(f"the surrogate finds no equilibrium under {mode}s {command.tolist()}")
-        return self._state(command, found)
-
-    def advance(self, command: np.ndarray, mode: str, start: State) -> State:
-        """Return the state a control step after ``start``, in motion.
-
-        Raises:
-            ConvergenceError: if a time step is not solved.
-            ValueError: for a malformed command, or for commanded efforts.
-        """
-        assert self._motion is not None
-        command = check_command(self.model.robot, command, mode)
-        if mode != "displacement":
-            raise ValueError(f"mode = {mode!r} is not available in motion on the surrogate; allowed: 'displacement'")
-        moved, found = self._motion.advance(
-            self._context, self._inertia, start.memory, start.command[None], command[None]
-        )
-        if not found[0]:
-            raise ConvergenceError(f"the surrogate cannot move to displacements {command.tolist()}")
-        state = self._state(command, self._motion.batch_state(self._context, moved, command[None], found))
-        return replace(
-            state,
-            condensed=partial(_condensed_in_motion, self._motion, moved),
-            velocity=self._motion.effector_velocity(moved).reshape(-1, 3),
-            memory=moved,
-        )
-
-    def _state(self, command: np.ndarray, found: BatchState) -> State:
-        displacement, effort, effector = found.displacement[0], found.effort[0], found.effector[0]
-        motion = self._motion
-        return State(
-            command=command.copy(),
-            displacement=displacement,
-            effort=effort,
-            effector=effector[: self._effectors].reshape(-1, 3),
-            slack=found.slack[0],
-            # W is evaluated on demand, because many agents never read it.
-            condensed=partial(_condensed, self.model, self._context, displacement, effort, effector, self._effectors),
-            velocity=np.zeros((self._effectors // 3, 3)),
-            memory=None if motion is None else motion.at_rest(self._context, found.displacement, found.effort),
-            uncertainty=float(found.uncertainty[0]),
-            distrust=int(found.distrust[0]),
-        )
+def _condensed(model: SurrogateModel, context: Context, state: BatchState) -> CondensedModel:
+    """Return the condensed models of states; of the coordinates of the effectors, they have those of the states."""
+    found = model.condensed(context, state.displacement)
+    W, effort, delta = found.compliance, found.effort.copy(), found.delta.array
+    # Slack cables carry no effort; the network's may differ from zero by rounding.
+    effort[:, : model.count] = state.effort
+    free, roles, rows = delta - np.einsum("bij,bj->bi", W, effort), found.roles, found.rows
+    if (effectors := state.effector.shape[1]) != model.effectors:
+        kept = np.delete(np.arange(len(rows)), np.arange(model.count + effectors, model.count + model.effectors))
+        W, free, effort, rows = W[:, kept[:, None], kept], free[:, kept], effort[:, kept], tuple(rows[k] for k in kept)
+        roles = tuple((role, effectors if role == "e" else size) for role, size in roles)
+    return CondensedModel(W, free, effort, roles, rows)
 
 
-def _condensed(
-    model: SurrogateModel,
-    context: Context,
-    displacement: np.ndarray,
-    effort: np.ndarray,
-    effector: np.ndarray,
-    effectors: int,
-) -> CondensedModel:
-    """Condensed model of a state: W of the network, and the state itself, in which slack cables have no effort.
-
-    Of the coordinates of the effectors, it has the first ``effectors``.
-    """
-    W = model.compliance(context, displacement[None])[0]
-    delta = np.concatenate([displacement, effector, model.sensed(context, displacement[None])[0]])
-    n = model.count
-    kept = np.delete(np.arange(len(delta)), np.arange(n + effectors, n + model.effectors))
-    W, delta = W[np.ix_(kept, kept)], delta[kept]
-    full = np.concatenate([effort, np.zeros(len(delta) - n)])
-    roles = tuple((role, effectors if role == "e" else size) for role, size in model.roles)
-    return CondensedModel(W, delta - W @ full, full, roles, tuple(model.rows[k] for k in kept))
-
-
-def _condensed_in_motion(motion: SurrogateMotion, state: MotionState) -> CondensedModel:
-    """Condensed model of the last time step of one body."""
-    many = motion.condensed(state)
-    return CondensedModel(many.compliance[0], many.free[0], many.effort[0], many.roles, many.rows)
+def _only(condensed: Callable[..., CondensedModel], *of: object) -> CondensedModel:
+    """Return the condensed model of a batch of one."""
+    many = condensed(*of)
+    return replace(many, compliance=many.compliance[0], free=many.free[0], effort=many.effort[0])
 
 
 def _motion_of(
@@ -289,22 +178,19 @@ def _motion_of(
     return SurrogateMotion(model, read_inertia(folder, model.robot), steps)
 
 
-class SurrogateBackend(Backend):
-    """States from a learned condensed model: static equilibria, or motion in time with a learned inertia.
+class SurrogateBatch(BatchBackend):
+    """States of many bodies from a learned condensed model, evaluated together.
 
     Args:
         robot: the robot.
-        design: first design; missing variables take their baseline.
-        weights: folder of weights; default the shipped ones.
+        designs: bodies, shape (B, number of design variables).
+        weights: folder of weights, or a model; default the shipped ones.
         members: how many members of the ensemble to use, fewer for speed; default all.
         dynamics: step in time, starting from the static equilibrium; for the robots whose weights have an inertia.
-        control_step: duration of one `step` [s].
-        time_step: largest physical time step [s]; commands are ramped over those of a control step.
-        mass_damping: Rayleigh's alpha [1/s].
-        stiffness_damping: Rayleigh's beta [s].
+        **steps: attributes of `TimeSteps`.
 
     Attributes:
-        model: the learned model.
+        model: the learned model. If a touch is learned, it is that of `LearnedTouch.variant`.
         steps: time steps of a control step, and damping.
 
     Raises:
@@ -315,124 +201,35 @@ class SurrogateBackend(Backend):
     def __init__(
         self,
         robot: Robot,
-        design: Mapping[str, float] | None = None,
-        weights: str | Path | None = None,
-        members: int | None = None,
-        *,
-        dynamics: bool = False,
-        control_step: float = 0.05,
-        time_step: float = 0.01,
-        mass_damping: float = 0.0,
-        stiffness_damping: float = 0.01,
-    ) -> None:
-        if not robot.learning.convex:
-            raise ValueError(
-                f"robot '{robot.name}' has a non-convex energy and cannot run on the surrogate alone; use "
-                "backend='fem', or its learned model as part of a gripper"
-            )
-        self.robot = robot
-        touch = robot.learning.touch
-        learned = robot if touch is None else touch.variant()
-        self.takes_touch = touch is not None
-        self.model = standalone_model(learned, weights, members)
-        self._touch: PointForce | None = None
-        self.steps = TimeSteps(control_step, time_step, mass_damping, stiffness_damping)
-        self._motion = _motion_of(self.model, weights, dynamics, self.steps)
-        self.moving = dynamics
-        self.design = None  # type: ignore[assignment]  # until the first reset
-        self.reset(robot.design_space.complete(design))
-
-    @classmethod
-    def batch_class(cls, robot: Robot, options: Mapping[str, object]) -> type[BatchBackend]:
-        return SurrogateBatch
-
-    def reset(self, design: Mapping[str, float] | None = None) -> State:
-        complete = self.design if design is None else self.robot.design_space.complete(design)
-        if complete != self.design:
-            body = SurrogateBody(self.model, complete, self._motion, effectors=3 * len(self.robot.effectors))
-            self._rest = body.rest()
-            self._untouched, self.design = body, complete
-        self._touch, self._body = None, self._untouched
-        self.state = self._rest
-        return self.state
-
-    def touch(self, load: PointForce | None) -> None:
-        if load is self._touch:
-            return
-        load = check_touch(self.robot, self._rest, load)
-        if load is None:
-            self._body = self._untouched
-        else:
-            learned = self.robot.learning.touch
-            if learned is None:
-                raise ValueError(f"no touch of robot '{self.robot.name}' is learned; use backend='fem'")
-            touch = learned.design(self.design, load.point, load.force)
-            effectors = 3 * len(self.robot.effectors)
-            self._body = SurrogateBody(self.model, self.design, self._motion, effectors=effectors, touch=touch)
-        self._touch = load
-
-    def _extra_state(self) -> PointForce | None:
-        return self._touch
-
-    def _resume(self, snapshot: Snapshot) -> None:
-        self.reset(snapshot.design)
-        self.touch(snapshot.extra)
-        self.restore(snapshot.state)
-
-    def step(self, command: np.ndarray, mode: str = "displacement", *, force: np.ndarray | None = None) -> State:
-        refuse_force(force)
-        if self.moving:
-            self.state = self._body.advance(command, mode, self.state)
-        else:
-            self.state = self._body.solve(command, mode, self.state)
-        return self.state
-
-    def probe(self, command: np.ndarray, mode: str = "displacement") -> State:
-        """Return the static equilibrium under a command without going there."""
-        return self._body.solve(command, mode, self.state)
-
-    def restore(self, state: State) -> None:
-        self.state = state
-
-
-class SurrogateBatch(BatchBackend):
-    """States of many bodies from a learned condensed model, evaluated together.
-
-    Args:
-        robot: the robot.
-        designs: bodies, shape (B, number of design variables).
-        weights: as for `SurrogateBackend`.
-        members: as for `SurrogateBackend`.
-        dynamics: as for `SurrogateBackend`.
-        **steps: attributes of `TimeSteps`.
-
-    Attributes:
-        model: the learned model.
-
-    Raises:
-        WeightsError: if there are no weights for the robot, they are damaged, or its actuators have a largest effort.
-    """
-
-    def __init__(
-        self,
-        robot: Robot,
         designs: np.ndarray,
-        weights: str | Path | None = None,
+        weights: SurrogateModel | str | Path | None = None,
         members: int | None = None,
         *,
         dynamics: bool = False,
         **steps: float,
     ) -> None:
-        self.robot = robot
-        self.model = standalone_model(robot, weights, members)
-        self._motion = _motion_of(self.model, weights, dynamics, TimeSteps(**steps))
+        self.robot, self._touch = robot, robot.learning.touch
+        self.takes_touch = self._touch is not None
+        self.steps = TimeSteps(**steps)
+        if isinstance(weights, SurrogateModel):
+            self.model, self._motion = weights, None
+        elif not robot.learning.convex:
+            raise ValueError(
+                f"robot '{robot.name}' has a non-convex energy and cannot run on the surrogate alone; use "
+                "backend='fem', or its learned model as part of a gripper"
+            )
+        else:
+            self.model = standalone_model(robot if self._touch is None else self._touch.variant(), weights, members)
+            self._motion = _motion_of(self.model, weights, dynamics, self.steps)
         self.moving = dynamics
-        self._unilateral = robot.unilateral
+        self._unilateral, self._effectors = robot.unilateral, 3 * len(robot.effectors)
         count = len(designs)
-        # One body for all rows, until they differ.
-        self._context = Context.shared(self.model.context(designs[:1]), count)
+        self._designs, self._touched = designs.copy(), np.zeros(count, dtype=bool)
         self.command = np.zeros((count, len(robot.actuators)))
-        rest = self._rest_states(self._context.rows(np.zeros(1, dtype=np.int64)), designs[:1])
+        # One body for all rows, until they differ.
+        one = self.model.context(self._values(designs[:1]))
+        rest = self._rest_states(one, designs[:1])
+        self._context = Context.shared(one, count)
         self._rest, self.state = rest.repeat(count), rest.repeat(count)
         if self._motion is not None:
             self._inertia = self._motion.inertia.body(designs)
@@ -442,47 +239,100 @@ class SurrogateBatch(BatchBackend):
         if len(other):
             self.begin(other, designs[other])
 
+    def _values(self, designs: np.ndarray, touch: Mapping[str, float] | None = None) -> np.ndarray:
+        """Return designs of the model, whose variables also say what touches a body; by default nothing does."""
+        if self._touch is None:
+            return designs
+        # Loads beyond those that were learned are judged as outside the box, not refused.
+        space, names = self.model.robot.design_space, self.robot.design_space.names
+        loads = {**space.baseline, **(touch or {})}
+        return np.array([[{**loads, **dict(zip(names, row, strict=True))}[k] for k in space.names] for row in designs])
+
     def _rest_states(self, context: Context, designs: np.ndarray) -> BatchState:
         rest = rest_state(self.model, context, self._unilateral)
         if not rest.converged.all():
             lost = designs[np.flatnonzero(~rest.converged)[0]].tolist()
             design = dict(zip(self.robot.design_space.names, lost, strict=True))
             raise ConvergenceError(f"the surrogate finds no equilibrium at rest of design {design}")
-        return rest
+        return self._own(rest)
+
+    def _own(self, state: BatchState) -> BatchState:
+        """Return states with the effectors of the robot only; the model may have more."""
+        if self._effectors == self.model.effectors:
+            return state
+        return replace(state, effector=state.effector[:, : self._effectors])
+
+    def _put(self, index: np.ndarray, context: Context) -> None:
+        """Give rows other contexts. That of a single body is replaced: its earlier states still read theirs."""
+        if len(index) == len(self.command) == 1:
+            self._context = context
+        else:
+            self._context.put(index, context)
 
     def begin(self, index: np.ndarray, designs: np.ndarray) -> Mapping[int, InfeasibleDesign]:
-        context = self.model.context(designs)
+        context = self.model.context(self._values(designs))
         rest = self._rest_states(context, designs)
-        self._context.put(index, context)
-        self._rest.put(index, rest)
+        self._put(index, context)
+        self._touched[index], self._designs[index] = False, designs
+        self._rest = self._rest.replaced(index, rest)
         if self._motion is not None:
             self._inertia[index] = self._motion.inertia.body(designs)
         self.rest(index)
         return {}
 
     def rest(self, index: np.ndarray) -> None:
-        self.command[index] = 0.0
+        self._touch_rows([(i, None) for i in index[self._touched[index]].tolist()])
         rest = self._rest.rows(index)
-        self.state.put(index, rest)
-        self.state.slack[index] = False
+        self.command = self.command.copy()
+        self.command[index] = 0.0
+        self.state = self.state.replaced(index, rest)
         if self._motion is not None:
             still = self._motion.at_rest(self._context.rows(index), rest.displacement, rest.effort)
-            self._moving.put(index, still)
-            self._settled.put(index, rest)
+            self._moving = self._moving.replaced(index, still)
+            self._settled = self._settled.replaced(index, rest)
 
-    def step(self, command: np.ndarray) -> None:
+    def touch(self, loads: Sequence[PointForce | None]) -> None:
+        changes = []
+        for i, load in enumerate(loads):
+            if load is not None or self._touched[i]:
+                still = np.array([i])
+                rest = self.row(np.zeros_like(self.command[i]), self._rest.rows(still), self._context.rows(still))
+                changes.append((i, check_touch(self.robot, rest, load)))
+        self._touch_rows(changes)
+
+    def _touch_rows(self, loads: Sequence[tuple[int, PointForce | None]]) -> None:
+        for i, load in loads:
+            design, touch = self._designs[i], None
+            if load is not None:
+                if self._touch is None:
+                    raise ValueError(f"no touch of robot '{self.robot.name}' is learned; use backend='fem'")
+                named = dict(zip(self.robot.design_space.names, design.tolist(), strict=True))
+                touch = self._touch.design(named, load.point, load.force)
+            self._put(np.array([i]), self.model.context(self._values(design[None], touch)))
+            self._touched[i] = load is not None
+
+    def equilibria(self, command: np.ndarray, mode: str = "displacement") -> BatchState:
+        """Return the equilibria under commands (B, n_a), displacements or efforts; the search begins at the present."""
         present = self.state
-        if self._motion is None:
-            state = solve_displacements(
+        if mode == "effort":
+            return self._own(solve_efforts(self.model, self._context, command, present.displacement))
+        return self._own(
+            solve_displacements(
                 self.model, self._context, command, present.displacement, self._unilateral, present.slack
             )
+        )
+
+    def step(self, command: np.ndarray, mode: str = "displacement") -> None:
+        present = self.state
+        if self._motion is None:
+            state = self.equilibria(command, mode)
         else:
             moved, solved = self._motion.advance(self._context, self._inertia, self._moving, self.command, command)
             self._moving = moved.where(solved, self._moving)
-            state = self._motion.batch_state(self._context, self._moving, command, solved)
-        found = state.converged.copy()
-        if found.all():
-            self.command, self.state = command, replace(state, converged=found)
+            state = self._own(self._motion.batch_state(self._context, self._moving, command, solved))
+        found = state.converged
+        if found[0] if len(found) == 1 else found.all():
+            self.command, self.state = command, state
         else:
             self.command = np.where(found[:, None], command, self.command)
             self.state = replace(state.where(found, present), converged=found)
@@ -504,12 +354,7 @@ class SurrogateBatch(BatchBackend):
     def condensed(self) -> CondensedModel:
         if self._motion is not None:
             return self._motion.condensed(self._moving)
-        batch = self.model.condensed(self._context, self.state.displacement)
-        effort, delta = batch.effort.copy(), batch.delta.array
-        # Slack cables carry no effort; the network's may differ from zero by rounding.
-        effort[:, : self.model.count] = self.state.effort
-        free = delta - np.einsum("bij,bj->bi", batch.compliance, effort)
-        return CondensedModel(batch.compliance, free, effort, batch.roles, batch.rows)
+        return _condensed(self.model, self._context, self.state)
 
     def settled(self) -> BatchState:
         if self._motion is None:
@@ -519,9 +364,155 @@ class SurrogateBatch(BatchBackend):
         found = solve_displacements(
             self.model, self._context, self.command, last.displacement, self._unilateral, last.slack
         )
-        self._settled = replace(found.where(found.converged, last), converged=found.converged)
+        self._settled = replace(self._own(found).where(found.converged, last), converged=found.converged)
         return self._settled
 
     def gradient(self, effector: np.ndarray, effort: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         state = self.state if self._motion is None else self._settled
-        return displacement_gradient(self.model, self._context, state, effector, effort)
+        unused = self.model.effectors - self._effectors
+        return displacement_gradient(self.model, self._context, state, np.pad(effector, ((0, 0), (0, unused))), effort)
+
+    # -- a batch of one -----------------------------------------------------------------------------------------------
+
+    def row(self, command: np.ndarray, state: BatchState, context: Context | None = None) -> State:
+        """Return an equilibrium of one body under a command (n_a,); by default the body is that of a batch of one."""
+        context, motion = context or self._context, self._motion
+        return State(
+            command=command,
+            displacement=state.displacement[0],
+            effort=state.effort[0],
+            effector=state.effector[0].reshape(-1, 3),
+            slack=state.slack[0],
+            # W is evaluated on demand, because many agents never read it.
+            condensed=partial(_only, _condensed, self.model, context, state),
+            velocity=np.zeros((self._effectors // 3, 3)),
+            memory=None if motion is None else motion.at_rest(context, state.displacement, state.effort),
+            uncertainty=float(state.uncertainty[0]),
+            distrust=int(state.distrust[0]),
+        )
+
+    def present(self, command: np.ndarray) -> State:
+        """Return the present state of a batch of one that moves, which a command (n_a,) has led to."""
+        assert self._motion is not None
+        return replace(
+            self.row(command, self.state),
+            condensed=partial(_only, self._motion.condensed, self._moving),
+            velocity=self._motion.effector_velocity(self._moving)[:, : self._effectors].reshape(-1, 3),
+            memory=self._moving,
+        )
+
+    def restore(self, state: State) -> None:
+        """Put a batch of one into a state of its body."""
+        self.command = state.command[None]
+        self.state = BatchState(
+            state.displacement[None], state.effort[None], state.effector.reshape(1, -1), state.slack[None],
+            np.ones(1, dtype=bool), np.array([state.uncertainty]), np.array([state.distrust]),
+        )  # fmt: skip
+        if self._motion is not None:
+            self._moving = state.memory
+
+
+class SurrogateBackend(Backend):
+    """One body on a learned condensed model, in static equilibria or in motion in time: a `SurrogateBatch` of one.
+
+    Args:
+        robot: the robot.
+        design: first design; missing variables take their baseline.
+        weights: folder of weights, or a model; default the shipped ones.
+        members: how many members of the ensemble to use, fewer for speed; default all.
+        dynamics: step in time, starting from the static equilibrium; for the robots whose weights have an inertia.
+        control_step: duration of one `step` [s].
+        time_step: largest physical time step [s]; commands are ramped over those of a control step.
+        mass_damping: Rayleigh's alpha [1/s].
+        stiffness_damping: Rayleigh's beta [s].
+
+    Attributes:
+        model: the learned model.
+        steps: time steps of a control step, and damping.
+
+    Raises:
+        WeightsError: if there are no weights for the robot, they are damaged, or its actuators have a largest effort.
+        ValueError: for a robot whose energy is not convex.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        design: Mapping[str, float] | None = None,
+        weights: SurrogateModel | str | Path | None = None,
+        members: int | None = None,
+        *,
+        dynamics: bool = False,
+        control_step: float = 0.05,
+        time_step: float = 0.01,
+        mass_damping: float = 0.0,
+        stiffness_damping: float = 0.01,
+    ) -> None:
+        self.robot, self.design = robot, robot.design_space.complete(design)
+        self._batch = SurrogateBatch(
+            robot, self.design.array[None], weights, members, dynamics=dynamics, control_step=control_step,
+            time_step=time_step, mass_damping=mass_damping, stiffness_damping=stiffness_damping,
+        )  # fmt: skip
+        self.model, self.steps, self.moving = self._batch.model, self._batch.steps, dynamics
+        self.takes_touch = self._batch.takes_touch
+        self._touch: PointForce | None = None
+        self.state = self._rest = self._batch.row(np.zeros(len(robot.actuators)), self._batch.state)
+
+    @classmethod
+    def batch_class(cls, robot: Robot, options: Mapping[str, object]) -> type[BatchBackend]:
+        return SurrogateBatch
+
+    def reset(self, design: Mapping[str, float] | None = None) -> State:
+        complete = self.design if design is None else self.robot.design_space.complete(design)
+        if complete != self.design:
+            self._batch.begin(_ONLY, complete.array[None])
+            self.design = complete
+            self._rest = self._batch.row(np.zeros(len(self.robot.actuators)), self._batch.state)
+        else:
+            self._batch.rest(_ONLY)
+        self._touch, self.state = None, self._rest
+        return self.state
+
+    def touch(self, load: PointForce | None) -> None:
+        if load is not self._touch:
+            self._batch.touch([load])
+            self._touch = load
+
+    def _extra_state(self) -> PointForce | None:
+        return self._touch
+
+    def _resume(self, snapshot: Snapshot) -> None:
+        self.reset(snapshot.design)
+        self.touch(snapshot.extra)
+        self.restore(snapshot.state)
+
+    def step(self, command: np.ndarray, mode: str = "displacement", *, force: np.ndarray | None = None) -> State:
+        refuse_force(force)
+        command = self._checked(command, mode)
+        if self.moving and mode != "displacement":
+            raise ValueError(f"mode = {mode!r} is not available in motion on the surrogate; allowed: 'displacement'")
+        batch = self._batch
+        batch.step(command[None], mode)
+        if not batch.state.converged[0]:
+            self.restore(self.state)
+            raise ConvergenceError(f"the surrogate finds no equilibrium under {mode}s {command.tolist()}")
+        self.state = batch.present(command) if self.moving else batch.row(command, batch.state)
+        return self.state
+
+    def probe(self, command: np.ndarray, mode: str = "displacement") -> State:
+        """Return the static equilibrium under a command without going there."""
+        command = self._checked(command, mode)
+        found = self._batch.equilibria(command[None], mode)
+        if not found.converged[0]:
+            raise ConvergenceError(f"the surrogate finds no equilibrium under {mode}s {command.tolist()}")
+        return self._batch.row(command, found)
+
+    def _checked(self, command: np.ndarray, mode: str) -> np.ndarray:
+        command = check_command(self.robot, command, mode)
+        if mode == "effort" and (command[self.robot.unilateral] < 0.0).any():
+            raise ValueError(f"efforts {command.tolist()} must not be negative: the actuators cannot push")
+        return command.copy()
+
+    def restore(self, state: State) -> None:
+        self.state = state
+        self._batch.restore(state)

@@ -13,11 +13,11 @@ two places and the squared periods ``P`` halfway between them, which change far 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
-from softgym_envs.backends.batch import BatchState
+from softgym_envs.backends.batch import BatchState, Rows
 from softgym_envs.backends.time_steps import TimeSteps
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.solvers.complementarity import solve_rows
@@ -30,7 +30,7 @@ TOLERANCE = 5e-5
 
 
 @dataclass(frozen=True)
-class MotionState:
+class MotionState(Rows):
     """Bodies at an instant.
 
     Attributes:
@@ -46,20 +46,6 @@ class MotionState:
     effort: np.ndarray
     compliance: np.ndarray
     root: np.ndarray
-
-    def rows(self, index: np.ndarray) -> MotionState:
-        """Return copies of some rows."""
-        return MotionState(*(getattr(self, f.name)[index] for f in fields(self)))
-
-    def put(self, index: np.ndarray, new: MotionState) -> None:
-        """Replace some rows."""
-        for f in fields(self):
-            getattr(self, f.name)[index] = getattr(new, f.name)
-
-    def where(self, found: np.ndarray, old: MotionState) -> MotionState:
-        """Return the rows of this state that are found, and those of ``old`` elsewhere."""
-        pairs = ((getattr(self, f.name), getattr(old, f.name)) for f in fields(self))
-        return MotionState(*(np.where(found.reshape(-1, *(1,) * (a.ndim - 1)), a, b) for a, b in pairs))
 
 
 class SurrogateMotion:
@@ -120,7 +106,7 @@ class SurrogateMotion:
             step = new.place[:, :n_a] - place[rows, :n_a]
             ended = solved & (np.abs(step) <= TOLERANCE * span).all(axis=1)
             found[rows[ended]] = True
-            moved.put(rows[ended], new.rows(np.flatnonzero(ended)))
+            moved = moved.replaced(rows[ended], new.rows(np.flatnonzero(ended)))
             place[rows] = new.place
             place[rows, :n_a] += np.clip(step, -span, span) - step
             rows = rows[solved & ~ended]
