@@ -14,7 +14,7 @@ from typing import Any
 import torch
 
 from softgym_envs.envs.registration import ENVIRONMENTS
-from softgym_envs.envs.torch_env import TorchVectorEnv
+from softgym_envs.extensions.gpu.environment import TorchVectorEnv
 from softgym_envs.storage import write_json
 
 #: Compiling takes most of the time of a run, and one robot is enough to show its effect.

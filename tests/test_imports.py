@@ -35,6 +35,7 @@ LAYERS = [
     # Extensions: no core package imports one. Those of one layer do not know each other.
     {"softgym_envs.extensions", "softgym_envs.extensions.design", "softgym_envs.extensions.sweeps"},
     {
+        "softgym_envs.extensions.gpu",
         "softgym_envs.extensions.grasping",
         "softgym_envs.extensions.hardware",
         "softgym_envs.extensions.leaderboard",

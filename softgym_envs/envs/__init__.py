@@ -8,7 +8,6 @@ if TYPE_CHECKING:
     from softgym_envs.envs.env import SoftRobotEnv as SoftRobotEnv
     from softgym_envs.envs.goals import GoalObservation as GoalObservation
     from softgym_envs.envs.tasks.base import Task as Task
-    from softgym_envs.envs.torch_env import TorchVectorEnv as TorchVectorEnv
 
 __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
@@ -16,6 +15,5 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "env": ["SoftRobotEnv"],
         "goals": ["GoalObservation"],
         "tasks.base": ["Task"],
-        "torch_env": ["TorchVectorEnv"],
     },
 )

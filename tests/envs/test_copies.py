@@ -155,7 +155,7 @@ def test_batches_are_copied_in_mid_episode(identifier):
 def test_batches_of_tensors_are_copied_in_mid_episode():
     import torch
 
-    from softgym_envs.envs import TorchVectorEnv
+    from softgym_envs.extensions.gpu import TorchVectorEnv
 
     env = TorchVectorEnv("SoftGym/FingerReach-v0", 3, device="cpu", sample_design=True, max_episode_steps=5, seed=0)
     env.reset()

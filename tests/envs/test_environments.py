@@ -226,7 +226,7 @@ def test_a_track_shows_the_goal_that_a_later_step_is_rated_by(kind, lookahead):
         spaces = env.unwrapped.spaces
     else:
         pytest.importorskip("torch")
-        from softgym_envs.envs.torch_env import TorchVectorEnv
+        from softgym_envs.extensions.gpu.environment import TorchVectorEnv
 
         env = TorchVectorEnv(identifier, 1, device="cpu", task_options=options)
         spaces = gymnasium.make(identifier).unwrapped.spaces

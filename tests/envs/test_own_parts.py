@@ -76,7 +76,7 @@ def test_a_robot_object_is_used_as_it_is():
 
 
 def test_your_own_task_in_every_environment():
-    from softgym_envs.envs.torch_env import TorchVectorEnv
+    from softgym_envs.extensions.gpu.environment import TorchVectorEnv
 
     single = gymnasium.make("SoftGym/FingerReach-v0", task=Approach)
     batch = gymnasium.make_vec("SoftGym/FingerReach-v0", num_envs=2, task=Approach)
@@ -217,7 +217,7 @@ def test_goals_in_millimetres_are_refused(options, name):
 
 
 def test_goals_in_millimetres_are_refused_at_reset():
-    from softgym_envs.envs.torch_env import TorchVectorEnv
+    from softgym_envs.extensions.gpu.environment import TorchVectorEnv
 
     id = "SoftGym/FingerReach-v0"
     for env in (gymnasium.make(id), gymnasium.make_vec(id, num_envs=2), TorchVectorEnv(id, 2, device="cpu")):

@@ -10,9 +10,9 @@ import torch
 from click.testing import CliRunner
 
 from softgym_envs import make_robot
-from softgym_envs.backends.torch_batch import TorchBatch
 from softgym_envs.cli.surrogates import calibrate_trust
 from softgym_envs.errors import WeightsError
+from softgym_envs.extensions.gpu.surrogates import TorchBatch
 from softgym_envs.surrogate import calibration as module
 from softgym_envs.surrogate.calibration import (
     FACTOR_OF,

@@ -11,7 +11,7 @@ import pytest
 from softgym_envs.robots.tetrapod import Tetrapod
 
 torch = pytest.importorskip("torch")
-from softgym_envs.envs.torch_env import TorchVectorEnv  # noqa: E402
+from softgym_envs.extensions.gpu.environment import TorchVectorEnv  # noqa: E402
 
 REACH = "SoftGym/TetrapodReach-v0"
 

@@ -21,8 +21,6 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from torch import Tensor
 
-from softgym_envs.backends.torch_batch import Bodies, State, TorchBatch, put_rows, repeat_body, take_rows
-from softgym_envs.backends.torch_parts import TorchParts
 from softgym_envs.envs.arrays import with_tensors
 from softgym_envs.envs.options import (
     EnvironmentOptions,
@@ -39,6 +37,8 @@ from softgym_envs.envs.options import (
 )
 from softgym_envs.envs.registration import ENVIRONMENTS, EnvironmentRow, find_row
 from softgym_envs.envs.tasks.base import draw_paths
+from softgym_envs.extensions.gpu.parts import TorchParts
+from softgym_envs.extensions.gpu.surrogates import Bodies, State, TorchBatch, put_rows, repeat_body, take_rows
 from softgym_envs.robots.registry import ROBOTS
 from softgym_envs.surrogate.pretrained import standalone_model
 

@@ -7,9 +7,9 @@ import torch
 from gymnasium.error import ResetNeeded
 
 import softgym_envs
-from softgym_envs.backends import torch_batch
-from softgym_envs.envs.torch_env import TorchVectorEnv
 from softgym_envs.errors import DesignError, WeightsError
+from softgym_envs.extensions.gpu import surrogates
+from softgym_envs.extensions.gpu.environment import TorchVectorEnv
 from softgym_envs.mechanics.solvers.complementarity import solve_complementarity
 
 IDENTIFIERS = [name for name, row in softgym_envs.ENVIRONMENTS.items() if row.backend == "surrogate"]
@@ -150,7 +150,7 @@ def test_rows_without_a_state_end_where_they_were(monkeypatch):
 
 def test_rows_that_take_longer_are_finished(monkeypatch):
     """With a single Newton step for all rows, most rows are finished separately and reach the same states."""
-    monkeypatch.setattr(torch_batch, "NEWTON_STEPS", 1)
+    monkeypatch.setattr(surrogates, "NEWTON_STEPS", 1)
     reference, env = pair("SoftGym/DiamondReach-v0", 8, sample_design=True)
     finish, calls = env._finish, []
     monkeypatch.setattr(env, "_finish", lambda result: calls.append(1) or finish(result))
@@ -256,14 +256,14 @@ def test_a_step_is_one_graph(identifier):
 
 @pytest.mark.parametrize("n", [1, 2, 4, 6])
 def test_complementarity(n, monkeypatch):
-    monkeypatch.setattr(torch_batch, "PIVOT_PASSES", 8)
+    monkeypatch.setattr(surrogates, "PIVOT_PASSES", 8)
     rng = np.random.default_rng(n)
     root = rng.normal(size=(500, n, n))
     K = root @ root.swapaxes(1, 2) + 0.3 * np.eye(n)
     q = rng.normal(size=(500, n))
     unilateral = np.arange(n) != 2
     guess = torch.as_tensor((rng.random((500, n)) < 0.5) & unilateral)
-    z, effort, slack, solved = torch_batch.complementarity(
+    z, effort, slack, solved = surrogates.complementarity(
         torch.as_tensor(K), torch.as_tensor(q), guess, tuple(unilateral.tolist())
     )
     W = np.linalg.inv(K)

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from softgym_envs.backends.time_steps import TimeSteps
-from softgym_envs.backends.torch_batch import Bodies
+from softgym_envs.extensions.gpu.surrogates import Bodies
 from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.constraints.servo import Servo
 from softgym_envs.mechanics.elements.parts import PoseParts, tip_stiffness
