@@ -10,7 +10,7 @@ from softgym_envs.backends.backend import State
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.envs.tasks.base import LENGTHS
 from softgym_envs.robots.base import Robot
-from softgym_envs.viewer.scene import STUB, Scene, check_display, obstacle_skins
+from softgym_envs.viewer.scene import STUB, Scene, check_display, ground_of, obstacle_skins
 from softgym_envs.viewer.surface import BodySurface, ShapeFinder, cable_lines
 
 MAX_DEFLECTION = 0.725
@@ -145,7 +145,8 @@ class ImageRenderer:
                 shape, nodes = BodySurface(self.shapes.load(other)), self.shapes.rest(other).nodes
                 assert nodes is not None
                 seen.append(shape.points(nodes))
-            self._scene = Scene(self.robot, self.size, np.concatenate(seen), window=self._window)
+            ground = ground_of(model, self.robot)
+            self._scene = Scene(self.robot, self.size, np.concatenate(seen), ground=ground, window=self._window)
         return self._scene
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from softgym_envs.backends.backend import State
 from softgym_envs.extras import require
+from softgym_envs.mechanics.contact.obstacles import Plane
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Robot
 from softgym_envs.viewer.surface import BodySurface, cable_lines, surface_kinds
@@ -150,19 +151,28 @@ class _Part:
 
 
 class Scene:
-    """A robot in front of a wall with a grid.
+    """A robot in front of a wall with a grid, or on the ground with one.
 
     Args:
         robot: the robot.
         size: width and height [pixels].
         cloud: points that the camera must see [m], shape (n, 3).
+        ground: what a robot that moves about stands on; the camera follows it once it leaves the picture.
         window: show the scene in a window, in place of off-screen images.
 
     Raises:
         ValueError: for a window without a display, or on one without OpenGL.
     """
 
-    def __init__(self, robot: Robot, size: tuple[int, int], cloud: np.ndarray, *, window: bool = False) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        size: tuple[int, int],
+        cloud: np.ndarray,
+        *,
+        ground: Plane | None = None,
+        window: bool = False,
+    ) -> None:
         if window:
             check_display()
         require("viewer")
@@ -175,7 +185,13 @@ class Scene:
         cloud = self._seen(cloud)
         self._open_window(size, window)
         self._place_camera(size, cloud)
-        self._draw_wall(size[0] / size[1], cloud)
+        self._ground = ground
+        if ground is None:
+            self._normal, self._height = np.eye(3)[0], float(cloud[:, 0].min()) - 0.15 * self._length
+        else:
+            self._normal = self._seen(np.asarray(ground.normal))
+            self._height = float(self._normal @ self._seen(np.asarray(ground.point)))
+        self._draw_grid(size[0] / size[1], cloud)
 
         self._shadow = _Part(self, "shadow", back=True, lit=False)
         self._ghost = _Part(self, "ghost", back=True, opacity=0.55)
@@ -188,6 +204,7 @@ class Scene:
         self._effectors = _Part(self, "effector", specular=0.4, faint=0.5)
         self._ball = pyvista.Sphere(radius=1.0, theta_resolution=24, phi_resolution=16)
         self._model: MechanicalModel | None = None
+        self._beyond = 0.0
         self._text: Any = None
         if size[1] >= 200:  # smaller captions would be illegible
             self._text = self._caption("", size, "left")
@@ -260,30 +277,50 @@ class Scene:
         camera.clipping_range = (0.3 * distance, 3.0 * distance)
         self._side = _unit(np.cross([0.0, 0.0, 1.0], _CAMERA))
 
-    def _draw_wall(self, aspect: float, cloud: np.ndarray) -> None:
-        """Draw a grid in the y-z plane behind the body that fades into the background."""
+    def _draw_grid(self, aspect: float, cloud: np.ndarray) -> None:
+        """Draw a grid on the wall behind the body, or on the ground, that fades into the background."""
         import pyvista
 
-        self._wall = float(cloud[:, 0].min()) - 0.15 * self._length
+        normal = self._normal
+        across = _unit(np.eye(3)[1] - normal[1] * normal)
+        plane = np.stack([across, np.cross(normal, across)])
         self._spacing = 10.0 ** np.floor(np.log10(0.2 * self._length))
-        centre = 0.5 * (cloud.min(axis=0) + cloud.max(axis=0))
+        low, high = cloud.min(axis=0), cloud.max(axis=0)
         reach = 1.8 * self._length * max(1.0, aspect)
+        if self._ground is not None:
+            reach = max(reach, 0.8 * float(np.linalg.norm(high - low)))
         count = int(np.ceil(reach / self._spacing))
-        middle = np.round(centre[1:] / self._spacing)
+        centre = 0.5 * plane @ (low + high)
         steps = np.arange(-count, count + 1)
-        y, z = np.meshgrid(middle[0] + steps, middle[1] + steps, indexing="ij")
-        points = np.stack([np.full(y.shape, self._wall), y * self._spacing, z * self._spacing], axis=-1).reshape(-1, 3)
+        y, z = np.meshgrid(*(np.round(centre / self._spacing)[:, None] + steps), indexing="ij")
+        places = self._spacing * np.stack([y, z], axis=-1).reshape(-1, 2)
+        points = self._height * normal + places @ plane
         index = np.arange(y.size).reshape(y.shape)
         ends = ((index[:-1], index[1:]), (index[:, :-1], index[:, 1:]))
         lines = np.concatenate([np.stack(pair, axis=-1).reshape(-1, 2) for pair in ends])
         mesh = _line_mesh(points, lines)
-        fade = np.clip(1.0 - np.linalg.norm(points - [self._wall, *centre[1:]], axis=1) / reach, 0.0, 1.0)[:, None]
+        fade = np.clip(1.0 - np.linalg.norm(places - centre, axis=1) / reach, 0.0, 1.0)[:, None]
         back, front = np.array(COLORS["background"]), np.array(COLORS["grid"])
         mesh.point_data["rgb"] = np.round(back + (front - back) * fade**0.7).astype(np.uint8)
-        actor = pyvista.Actor(mapper=pyvista.DataSetMapper(mesh))
-        actor.mapper.set_scalars(mesh["rgb"], "rgb", rgb=True)
-        actor.prop.lighting, actor.prop.line_width = False, 1.3 * self._line
-        self.back.AddActor(actor)
+        self._grid = pyvista.Actor(mapper=pyvista.DataSetMapper(mesh))
+        self._grid.mapper.set_scalars(mesh["rgb"], "rgb", rgb=True)
+        self._grid.prop.lighting, self._grid.prop.line_width = False, 1.3 * self._line
+        self.back.AddActor(self._grid)
+
+    def _follow(self, model: MechanicalModel, x: np.ndarray) -> None:
+        """Move the camera on with a robot that has gone out of the picture."""
+        row = self.robot.body_frame
+        if self._ground is None or row is None:
+            return
+        beyond = max(float(x[row, 0] - model.nodes[row, 0]) - self.robot.view.way * self._length, 0.0)
+        ahead = self._seen(np.eye(3)[0])
+        camera, move = self.plotter.camera, (beyond - self._beyond) * ahead
+        camera.position, camera.focal_point = np.add(camera.position, move), np.add(camera.focal_point, move)
+        self._beyond = beyond
+        # The grid goes on by whole squares, so that it seems to stand still.
+        self._grid.position = (
+            np.floor(beyond / self._spacing) * self._spacing * (ahead - self._normal[1] * self._normal)
+        )
 
     # -- moving objects ---------------------------------------------------------------------------------------------
 
@@ -304,16 +341,16 @@ class Scene:
             self._shadow.show(self._flat)
             self._seams = _line_mesh(np.zeros_like(self._surface.shape(x)), self._surface.edges)
             self._edges.show(self._seams)
-            skins = [(self._seen(points), faces) for points, faces in obstacle_skins(model, self.robot)]
+            others = obstacle_skins(model, self.robot, ground=self._ground)
+            skins = [(self._seen(points), faces) for points, faces in others]
             parts = [pyvista.PolyData.from_regular_faces(*skin) for skin in skins]
             self._obstacles.show(pyvista.merge(parts) if parts else None)
+        self._follow(model, x)
         points = self._seen(self._surface.points(x))
         _move(self._skin, points, self._surface.normals(points))
-        light = -_LIGHT / _LIGHT[0]
-        flat = points + (points[:, :1] - self._wall) * light
         # Slightly behind the grid, so that the grid stays visible.
-        flat[:, 0] = self._wall - 2e-3 * self._length
-        _move(self._flat, flat)
+        away = points @ self._normal - (self._height - 2e-3 * self._length)
+        _move(self._flat, points - away[:, None] * _LIGHT / (_LIGHT @ self._normal))
         # Slightly in front of the skin, so that the edges stay visible.
         _move(self._seams, self._seen(self._surface.shape(x)) + 2e-3 * self._length * _unit(_CAMERA))
 
@@ -405,15 +442,26 @@ def _surface_mesh(surface: BodySurface) -> pyvista.PolyData:
     return pyvista.PolyData.from_regular_faces(np.zeros((len(surface.nodes), 3)), surface.triangles)
 
 
-def obstacle_skins(model: MechanicalModel, robot: Robot) -> list[tuple[np.ndarray, np.ndarray]]:
+def ground_of(model: MechanicalModel, robot: Robot) -> Plane | None:
+    """Return the plane on which a robot moves about; None for one that stays where it is, or that nothing carries."""
+    if not robot.view.way or model.contact is None:
+        return None
+    return next((o for o in model.contact.obstacles if isinstance(o, Plane) and o.frame is None), None)
+
+
+def obstacle_skins(
+    model: MechanicalModel, robot: Robot, *, ground: Plane | None = None
+) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return vertices [m] and triangles of the obstacles that stand still; those that move are skins of the body.
 
     Args:
         model: body with its contacts.
         robot: an infinite obstacle is shown up to three quarters of its size to each side, and under its way.
+        ground: an obstacle that is left out.
     """
     half = (0.75 + robot.view.way) * robot.size
-    return [o.skin(half) for o in (model.contact.obstacles if model.contact else ()) if o.frame is None]
+    obstacles = model.contact.obstacles if model.contact else ()
+    return [o.skin(half) for o in obstacles if o.frame is None and o != ground]
 
 
 def _move(mesh: pyvista.PolyData, points: np.ndarray, normals: np.ndarray | None = None) -> None:
