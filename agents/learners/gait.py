@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -20,6 +20,9 @@ from softgym_envs.agents.learners.base import Learner, Tensors, check_weights
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.config import Config
 from softgym_envs.errors import ConvergenceError
+
+if TYPE_CHECKING:
+    from softgym_envs.mechanics.solvers.beam_design import Neighbours
 
 TIGHTNESS = 1.0
 """How fast commands follow those of the gait, in their rates over a distance to them of one rate."""
@@ -40,6 +43,20 @@ class GaitConfig(Config):
     spread: float = Field(
         default=0.05, ge=0, description="by which the seed moves the start away from the reference gait, in half ranges"
     )
+
+
+class Climb(NamedTuple):
+    """A motion, and derivatives of its way ahead less the charge for the way sideways.
+
+    Attributes:
+        way: ahead after the first period [m].
+        by_gait: derivative by the gait, shape (p, n_a).
+        by_design: by the design variables, shape (d,); none where no neighbours of the body were given.
+    """
+
+    way: float
+    by_gait: np.ndarray
+    by_design: np.ndarray
 
 
 class GaitLearner(Learner):
@@ -100,7 +117,7 @@ class GaitLearner(Learner):
         steps = settings.period * settings.periods
         while self.step < target:
             try:
-                way, gradient = self.climb()
+                way, gradient, _ = self.climb()
             except ConvergenceError:  # a gait that cannot be computed: back to a calmer one
                 self.gait *= 0.8
             else:
@@ -119,12 +136,11 @@ class GaitLearner(Learner):
         rate = (1.0 - share) * settings.learning_rate + share * settings.final_learning_rate
         self.gait = np.clip(self.gait + rate * self._mean / (1.0 - FORGET**count) / size, -1.0, 1.0)
 
-    def climb(self) -> tuple[float, np.ndarray]:
+    def climb(self, neighbours: Neighbours | None = None) -> Climb:
         """Move the body from rest, and return how the gait should change.
 
-        Returns:
-            Way ahead after the first period [m], and the derivative by the gait of this way less the charge for the way
-            sideways, shape (p, n_a).
+        Args:
+            neighbours: of the present body, if that is to change too (`softgym_envs.robots.neighbours`).
 
         Raises:
             ConvergenceError: if a time step cannot be computed.
@@ -141,7 +157,8 @@ class GaitLearner(Learner):
         by_way = np.array([1.0, -settings.drift * np.sign(way[1]), 0.0])
         by_x = np.zeros_like(rollout.x)
         by_x[end, row], by_x[begin, row] = by_way, -by_way
-        by_part = rollout.gradient(by_x=by_x).commands.reshape(count, parts, -1)
+        found = rollout.gradient(by_x=by_x, neighbours=neighbours)
+        by_part = found.commands.reshape(count, parts, -1)
         # Time steps lie on a ramp from the last command to the next.
         share = (np.arange(1, parts + 1) / parts)[:, None]
         by_command = (share * by_part).sum(axis=1)
@@ -151,7 +168,7 @@ class GaitLearner(Learner):
             carried = carried + by_command[k]
             gradient[k % settings.period] += carried * pull[k]
             carried = carried * follow[k]
-        return float(way[0]), self._straight(gradient)
+        return Climb(float(way[0]), self._straight(gradient), found.design)
 
     def _straight(self, change: np.ndarray) -> np.ndarray:
         """Return the part of a change of the gait (p, n_a) after which both sides still do the same in turns."""

@@ -25,7 +25,7 @@ def test_the_gradient_is_that_of_the_way(monkeypatch):
     learner = GaitLearner(config(30, gait={"periods": 2}))
     # Converged so far that differences of ways are exact.
     monkeypatch.setattr(learner.backend._dynamics, "tolerance", 1e-11)
-    start, (_, gradient) = learner.gait, learner.climb()
+    start, gradient = learner.gait, learner.climb().by_gait
     row = learner.env.robot.body_frame
 
     def value(gait):
