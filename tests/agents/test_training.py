@@ -424,6 +424,8 @@ def test_goals_repeat_and_belong_to_the_body():
     [
         "finger_reach",
         "finger_reach_designs",
+        "tetrapod_carry",
+        "tetrapod_carry_kilogram",
         "tetrapod_reach_analytic",
     ],
 )
