@@ -48,10 +48,30 @@ class LegFunction:
         self.shape = np.asarray(shape, dtype=float) if isinstance(shape, np.ndarray) else shape
         depth = sum(name.startswith("layers.") and name.endswith(".weight") for name in tensors)
         names = [*(f"layers.{k}" for k in range(depth)), "head"]
-        self._layers = [(self._own(tensors[f"{name}.weight"]), self._own(tensors[f"{name}.bias"])) for name in names]
+        self._layers = self._layers_of(tensors, names)
+        count = sum(name.startswith("errors.") and name.endswith(".weight") for name in tensors)
+        self._errors = self._layers_of(tensors, [f"errors.layers.{k}" for k in range(count)])
+
+    def _layers_of(self, tensors: Mapping[str, Array], names: list[str]) -> list[tuple[Array, Array]]:
+        return [(self._own(tensors[f"{name}.weight"]), self._own(tensors[f"{name}.bias"])) for name in names]
 
     def _own(self, values: Array) -> Array:
         return np.array(values, dtype=float) if isinstance(self.shape, np.ndarray) else values
+
+    def errors(self, y: Array) -> Array:
+        """Return how far tips at poses (n, 15) may move under the errors of their wrenches, over the length, (n,).
+
+        They are those of `ErrorNetwork`: nearly all errors of the states that it learned from are smaller.
+        """
+        xp = namespace(y)
+        found = features(Jet.coordinates(y), [self.shape[..., k] for k in range(5)], xp.log, JetFunctions)
+        even, odd = (columns(part, y)[0] for part in (found.even, found.odd))
+        x = xp.concatenate([even, PRODUCT_SCALE * odd[:, _I] * odd[:, _J]], axis=1)
+        for weight, bias in self._errors[:-1]:
+            a = x @ weight.T + bias
+            x = 0.5 * a * (1.0 + xp.tanh(0.5 * a))
+        weight, bias = self._errors[-1]
+        return xp.exp(x @ weight.T + bias)[:, 0]
 
     def evaluate(self, y: Array, *, second: bool = True) -> tuple[Array, Array, Array]:
         """Return energies (n,), gradients (n, 15) and Hessians (n, 15, 15) at poses (n, 15).

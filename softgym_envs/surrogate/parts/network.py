@@ -16,6 +16,7 @@ from softgym_envs.surrogate.parts.pose import (
     PRODUCT_SCALE,
     PRODUCTS,
     STIFFEST,
+    Features,
     features,
 )
 
@@ -28,6 +29,15 @@ MATHS = SimpleNamespace(
     softplus=torch.nn.functional.softplus,
 )
 _FIRST, _SECOND = torch.tensor(PRODUCTS).T
+INPUTS = EVEN + len(PRODUCTS)
+
+
+def _inputs(y: Tensor, shape: Tensor) -> tuple[Features, Tensor, Tensor]:
+    """Return features, products of odd ones, and the inputs (n, `INPUTS`) of networks at poses (n, 15)."""
+    found = features(y.unbind(1), shape.unbind(1), torch.log, MATHS)
+    odd = torch.stack(found.odd, 1)
+    products = odd[:, _FIRST] * odd[:, _SECOND]
+    return found, products, torch.cat([torch.stack(found.even, 1), PRODUCT_SCALE * products], 1)
 
 
 class LegNetwork(torch.nn.Module):
@@ -43,17 +53,14 @@ class LegNetwork(torch.nn.Module):
 
     def __init__(self, width: int, depth: int) -> None:
         super().__init__()
-        sizes = [EVEN + len(PRODUCTS), *[width] * depth]
+        sizes = [INPUTS, *[width] * depth]
         self.layers = torch.nn.ModuleList([torch.nn.Linear(i, o) for i, o in zip(sizes[:-1], sizes[1:], strict=True)])
         self.head = torch.nn.Linear(width, OUTPUTS)
         torch.nn.init.normal_(self.head.weight, std=0.01)
 
     def forward(self, y: Tensor, shape: Tensor) -> Tensor:
         """Return energies (n,) at poses ``y`` (n, 15) of legs of shapes (n, 5)."""
-        found = features(y.unbind(1), shape.unbind(1), torch.log, MATHS)
-        odd = torch.stack(found.odd, 1)
-        products = odd[:, _FIRST] * odd[:, _SECOND]
-        x = torch.cat([torch.stack(found.even, 1), PRODUCT_SCALE * products], 1)
+        found, products, x = _inputs(y, shape)
         for k, layer in enumerate(self.layers):
             new = torch.nn.functional.silu(layer(x))
             x = new if k == 0 else x + new
@@ -64,3 +71,23 @@ class LegNetwork(torch.nn.Module):
         form = out[:, 1 : 1 + count] + stiff[:, None] * out[:, 1 + count :]
         bent = 0.5 * (found.turn + HALF_PI) ** 2
         return bent + OFFSET_SCALE * out[:, 0] + FORM_SCALE * (form * products).sum(1)
+
+
+class ErrorNetwork(torch.nn.Module):
+    """How far the tip of a leg may move under the error of the wrench that `LegNetwork` gives it, over its length.
+
+    Args:
+        width: of the two hidden layers.
+    """
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        sizes = [INPUTS, width, width, 1]
+        self.layers = torch.nn.ModuleList([torch.nn.Linear(i, o) for i, o in zip(sizes[:-1], sizes[1:], strict=True)])
+
+    def forward(self, y: Tensor, shape: Tensor) -> Tensor:
+        """Return logarithms (n,) at poses ``y`` (n, 15) of legs of shapes (n, 5)."""
+        x = _inputs(y, shape)[2]
+        for layer in self.layers[:-1]:
+            x = torch.nn.functional.silu(layer(x))
+        return self.layers[-1](x)[:, 0]

@@ -30,6 +30,8 @@ WRENCH, MIDDLE, ENERGY, STIFFNESS = 25.0, 100.0, 0.02, 3.0
 energy, and of the stiffness."""
 OUTLIER = 4.0
 """Loss of a state above which it counts less: some states are on another branch than others at the same pose."""
+QUANTILE, SMALLEST, ERROR_WIDTH = 0.95, 1e-4, 48
+"""Share of errors that `ErrorNetwork` covers, error that counts as none, and the width of the network."""
 CHECKED = 4000
 """States of the validation on which the loss is computed."""
 
@@ -181,7 +183,7 @@ def fit_part(
     require("train")
     import torch
 
-    from softgym_envs.surrogate.parts.network import LegNetwork
+    from softgym_envs.surrogate.parts.network import ErrorNetwork, LegNetwork
 
     folder = Path(folder)
     every = generate_part_data(config, data_folder)
@@ -208,17 +210,24 @@ def fit_part(
     start = time.perf_counter()
     trainer = Trainer(config.network, config.seed, folder / "parts", key, progress)
     history = trainer.optimise("leg", net, loss, len(training))
-    moved = torch.cat(
-        [
-            leg_loss(net, tuple(p[rows] for p in test.parts), torch.zeros(len(rows), 6), training=False)[1]
-            for rows in torch.arange(len(test)).split(2000)
-        ]
-    )
-    size = moved.norm(dim=1)
+    torch.manual_seed(config.seed)
+    bound = ErrorNetwork(ERROR_WIDTH)
+    learned, seen = ((split.parts[0], split.parts[1], _moved(net, split).log()) for split in (training, validation))
+
+    def quantile_loss(index: Tensor | None) -> Tensor:
+        y, shape, size = seen if index is None else (column[index] for column in learned)
+        above = size - bound(y, shape)
+        return torch.maximum(QUANTILE * above, (QUANTILE - 1.0) * above).mean()
+
+    trainer.optimise("errors", bound, quantile_loss, len(training))
+    size = _moved(net, test)
+    with torch.no_grad():
+        covered = size <= bound(test.parts[0], test.parts[1]).exp()
     errors = {
         "states": len(test),
         "moved_median": float(size.median()),
         "moved_p95": float(size.quantile(0.95)),
+        "covered": float(covered.double().mean()),
         "best_validation": min(row["validation"] for row in history),
     }
     card = {
@@ -229,9 +238,21 @@ def fit_part(
         "training_seconds": round(time.perf_counter() - start, 1),
         "test": errors,
     }
-    write_leg({name: value.numpy() for name, value in net.state_dict().items()}, card, folder)
+    tensors = net.state_dict() | {f"errors.{name}": value for name, value in bound.state_dict().items()}
+    write_leg({name: value.numpy() for name, value in tensors.items()}, card, folder)
     RunFolder(folder, PartConfig, "a fit").begin(config)
     return errors
+
+
+def _moved(net: Any, batch: Batch) -> Tensor:
+    """Return how far tips move under the errors of their wrenches, over the length, shape (n,)."""
+    import torch
+
+    found = [
+        leg_loss(net, tuple(p[rows] for p in batch.parts), torch.zeros(len(rows), 6), training=False)[1].norm(dim=1)
+        for rows in torch.arange(len(batch)).split(2000)
+    ]
+    return torch.cat(found).clamp(min=SMALLEST)
 
 
 def _digest(states: LegStates) -> str:
