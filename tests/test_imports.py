@@ -38,6 +38,7 @@ LAYERS = [
         "softgym_envs.extensions.gpu",
         "softgym_envs.extensions.grasping",
         "softgym_envs.extensions.hardware",
+        "softgym_envs.extensions.hybrid",
         "softgym_envs.extensions.leaderboard",
         "softgym_envs.extensions.learners",
         "softgym_envs.extensions.measured",

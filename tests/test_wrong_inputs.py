@@ -214,7 +214,7 @@ MISTAKES = {
     ),
     "backend": (
         lambda _: gymnasium.make(REACH, backend="femm"),
-        "unknown backend 'femm'; did you mean 'fem'? allowed: fem, surrogate, hybrid, hardware",
+        "unknown backend 'femm'; did you mean 'fem'? allowed: fem, surrogate, hardware, hybrid",
     ),
     "task option": (
         lambda _: gymnasium.make(REACH, task_options={"spred": 0.1}),
@@ -266,7 +266,7 @@ MISTAKES = {
     ),
     "shipped policy": (
         lambda _: Policy("finger_rech"),
-        "unknown policy 'finger_rech'; did you mean 'finger_reach'? allowed too: a policy file (.safetensors)",
+        "unknown policy 'finger_rech'; did you mean 'finger_reach'? allowed*a policy file (.safetensors)",
     ),
     "name without a list": (
         lambda _: gymnasium.make(REACH, sample_design="length"),

@@ -18,7 +18,6 @@ BACKENDS = Registry(
     {
         "fem": "softgym_envs.backends.fem:FEMBackend",
         "surrogate": "softgym_envs.backends.surrogate:SurrogateBackend",
-        "hybrid": "softgym_envs.backends.hybrid:HybridBackend",
     },
     base="softgym_envs.backends.backend:Backend",
     group="softgym_envs.backends",

@@ -14,9 +14,9 @@ import softgym_envs  # noqa: F401  (registers the environments)
 from softgym_envs import make_robot
 from softgym_envs.backends import make_backend
 from softgym_envs.backends.fem import FEMBackend
-from softgym_envs.backends.hybrid import HybridBackend
 from softgym_envs.backends.surrogate import SurrogateBackend, SurrogateBatch
 from softgym_envs.errors import ConvergenceError, DataError, WeightsError
+from softgym_envs.extensions.hybrid.backend import HybridBackend
 from softgym_envs.testing import train_small_surrogate
 
 LIMIT = 8e-3  # largest displacement in the training of `weights` [m]

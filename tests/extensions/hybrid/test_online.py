@@ -9,8 +9,8 @@ import pytest
 
 from softgym_envs import make_robot
 from softgym_envs.errors import DataError, WeightsError
+from softgym_envs.extensions.hybrid.online import StateStore, check_ensemble, fine_tune, is_tuned_from, rehearsal_states
 from softgym_envs.surrogate.data.dataset import COLUMNS
-from softgym_envs.surrogate.online import StateStore, check_ensemble, fine_tune, is_tuned_from, rehearsal_states
 from softgym_envs.surrogate.potential.model import Model
 from softgym_envs.surrogate.potential.training import stack_members, unstack_members
 from softgym_envs.surrogate.pretrained import pretrained_model

@@ -19,10 +19,10 @@ from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.backends.surrogate import SurrogateBackend
 from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError, DataError
+from softgym_envs.extensions.hybrid.online import StateStore, check_ensemble, fine_tune, is_tuned_from
 from softgym_envs.mechanics.solvers.complementarity import solve_complementarity
 from softgym_envs.mechanics.solvers.equilibrium import RowLayout
 from softgym_envs.robots.base import Robot
-from softgym_envs.surrogate.online import StateStore, check_ensemble, fine_tune, is_tuned_from
 from softgym_envs.surrogate.potential.model import Model
 from softgym_envs.surrogate.pretrained import pretrained_model
 from softgym_envs.surrogate.weight_files import load_model, save_model
