@@ -33,7 +33,7 @@ class SACConfig(Config):
     learning_starts: int = Field(default=1_000, ge=0)
     gradient_steps: int = Field(default=8, gt=0, description="per step of all environments together")
     net_arch: list[int] = [128, 128]
-    ent_coef: float | str = "auto"
+    ent_coef: float | str = Field(default="auto_0.02", description="a number, 'auto' or 'auto_' and the start")
     target_entropy: float | Literal["auto"] = "auto"
     warm_up: Literal["actions", "postures"] = Field(
         default="actions",
