@@ -111,7 +111,7 @@ def check_robot(
     for variable in robot.design_space:
         progress(f"variable {variable.name}")
         yield from _variable(robot, variable.name, rest, rests)
-    yield _learning(robot)
+    yield _learning(robot, model)
 
 
 def _rest(robot: Robot, statics: Statics) -> Equilibrium:
@@ -171,7 +171,7 @@ def wall_layers(nodes: np.ndarray, block: SolidBlock) -> tuple[float, float]:
         length, mean_edge = _through(nodes, tetrahedra, owners, edges, element, face, start, normal)
         if length > 0.0:
             lengths.append(length)
-            layers.append(length / mean_edge)
+            layers.append(max(1.0, length / mean_edge))  # flat elements are one layer, too
     order = np.argsort(lengths)[: max(1, len(lengths) // 20)]
     return float(np.mean(np.array(lengths)[order])), float(np.mean(np.array(layers)[order]))
 
@@ -363,11 +363,14 @@ def _distance(one: np.ndarray, other: np.ndarray) -> float:
     return float(np.linalg.norm(one - other) / np.linalg.norm(other))
 
 
-def _learning(robot: Robot) -> Finding:
+def _learning(robot: Robot, model: MechanicalModel) -> Finding:
     if limited := [actuator.name for actuator in robot.actuators if np.isfinite(actuator.max_effort)]:
         text = f"no surrogate: a learned model drives {', '.join(limited)} beyond max_effort"
         return Finding("surrogate", "note", text, "backend='fem', or leave max_effort out and check efforts afterwards")
     if robot.obstacles:
         return Finding("surrogate", "note", "no surrogate: obstacles are never part of one", "backend='fem'")
+    if stretching := [drive.name for drive in model.constraints["a"] if drive.compliance]:
+        text = f"no surrogate: the drives of {', '.join(stretching)} stretch"
+        return Finding("surrogate", "note", text, "backend='fem'")
     ships = "weights ship" if ships_weights(robot) else "no weights ship; `softgym fit` learns them"
     return Finding("surrogate", "good", ships)

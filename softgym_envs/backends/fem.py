@@ -160,7 +160,6 @@ class FEMBackend(Backend):
         if complete != self.design:
             model = self._build(complete)
             self._set_friction(model)
-            self._set_compliance(model)
             own, loads = (model.contact, model.gravity.tolist()), model.nodal_loads.copy()
             self._stand(self._ground, model, own)
             self._settle(model)
@@ -264,8 +263,7 @@ class FEMBackend(Backend):
         if np.array_equal(compliance, self._compliance):
             return
         self._compliance = compliance
-        self._set_compliance(self.model)
-        self._statics.compliance[: len(compliance)] = compliance
+        self._stretch(self._statics)
 
     def _checked_compliance(self, compliance: float | Sequence[float] | np.ndarray) -> np.ndarray:
         try:
@@ -281,18 +279,18 @@ class FEMBackend(Backend):
             raise ValueError("cable_compliance is computed in statics without contact only; allowed here: 0")
         return values
 
-    def _set_compliance(self, model: MechanicalModel) -> None:
-        """Set how far the model's cables stretch, beyond what is part of the robot."""
-        if not self._compliance.any():
-            return
-        for constraint, value in zip(model.constraints["a"], self._compliance, strict=True):
+    def _stretch(self, statics: Statics) -> None:
+        """Set how far cables stretch: what is part of the robot, and what only the plant has and no model knows."""
+        for row, (constraint, value) in enumerate(zip(statics.model.constraints["a"], self._compliance, strict=True)):
             if value and not isinstance(constraint, Cable):
                 raise ValueError(f"cable_compliance: actuator '{constraint.name}' of '{self.robot.name}' is no cable")
-            constraint.compliance = float(value)
+            statics.compliance[row] = constraint.compliance + value
 
     def _solver(self, model: MechanicalModel) -> Statics:
         """Return the static solver of a body."""
         statics = Statics(model)
+        if self._compliance.any():
+            self._stretch(statics)
         linear, learned = statics.linearisation, any(block.learned for block in model.blocks)
         # In contact, only W needs the last factorisation of a step: it is made when W is read.
         statics.exact_compliance = linear.contact is None or linear.has_friction or learned

@@ -140,6 +140,9 @@ class OneByOne(BatchBackend):
     def condensed(self) -> CondensedModel:
         found = [owner.state.condensed for owner in self.owners]
         parts: Any = {name: _stack([getattr(one, name) for one in found]) for name in ("compliance", "free", "effort")}
+        if any(np.any(one.stretch) for one in found):
+            actuators = dict(found[0].roles)["a"]
+            parts["stretch"] = np.stack([np.broadcast_to(one.stretch, (actuators,)) for one in found])
         return replace(found[0], **parts)
 
     def settled(self) -> BatchState:
@@ -154,8 +157,10 @@ class OneByOne(BatchBackend):
         return self._together(self._settled, found)
 
     def gradient(self, effector: np.ndarray, effort: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        models = [state.condensed for state in self._settled]
-        gap = np.stack([state.displacement - state.command for state in self._settled])
+        models = [state.condensed.at_drives for state in self._settled]
+        # Commands move the far ends of drives that stretch.
+        stretched = [state.displacement + state.condensed.stretch * state.effort for state in self._settled]
+        gap = np.stack(stretched) - np.stack([state.command for state in self._settled])
         a, e = (models[0].slices[role] for role in "ae")
         compliance, follows = np.stack([model.compliance for model in models]), np.abs(gap) < 1e-6 * self.robot.rates
         return condensed_gradient(compliance, a, e, follows, effector, effort)

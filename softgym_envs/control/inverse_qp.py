@@ -100,7 +100,7 @@ class InverseQP:
             quantity, and from the state of the model in the other.
 
     Attributes:
-        displacement: actuator displacements that the model predicts for the last result, shape (n_a,).
+        displacement: displacements at the drives that the model predicts for the last result, shape (n_a,).
         effort: actuator efforts that the model predicts for the last result, shape (n_a,).
 
     Raises:
@@ -380,6 +380,7 @@ class InverseQP:
         self, condensed: CondensedModel, goal: np.ndarray, command: np.ndarray, slack: np.ndarray | None
     ) -> _Program:
         """Return the scaled QP of a step; leading shapes of the arguments are a batch."""
+        condensed = condensed.at_drives  # commands are what the far ends of the drives do
         delta, effort = condensed.delta, condensed.lambda_.a
         root = np.ones(goal.shape[-1]) if self.goal_weights is None else np.sqrt(self.goal_weights)
         Waa, Wea = condensed.W.aa, root[:, None] * condensed.W.ea

@@ -11,7 +11,7 @@ the equilibrium,
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -139,6 +139,7 @@ class CondensedModel:
         effort: efforts at which the model was computed, shape (..., n).
         roles: role letters and sizes, in order.
         rows: names and units of the rows, where they are known.
+        stretch: how far what drives each actuator stretches per effort, shape (n_a,), or zero for rigid drives.
 
     Any leading shape is a batch. Effector entries of delta are absolute positions [m].
     """
@@ -148,6 +149,7 @@ class CondensedModel:
     effort: np.ndarray
     roles: Roles
     rows: tuple[Row, ...] = ()
+    stretch: np.ndarray | float = 0.0
 
     @property
     def slices(self) -> dict[str, slice]:
@@ -185,6 +187,15 @@ class CondensedModel:
         """Displacements at the state of the model, ``W effort + delta_free``."""
         delta = np.einsum("...ij,...j->...i", self.compliance, self.effort) + self.free
         return RoleVector("delta", delta, self)
+
+    @property
+    def at_drives(self) -> CondensedModel:
+        """The model whose actuator displacements are the commands: those of the actuators and what drives stretch."""
+        if not np.any(self.stretch):
+            return self
+        compliance, actuators = self.compliance.copy(), np.arange(dict(self.roles)["a"])
+        compliance[..., actuators, actuators] += self.stretch
+        return replace(self, compliance=compliance, stretch=0.0)
 
     def __repr__(self) -> str:
         batch = self.free.shape[:-1]

@@ -376,7 +376,8 @@ def check_learnable(robot: Robot, config: FitConfig) -> None:
     """Refuse, before any state is solved, a robot whose learned model no backend would take.
 
     Raises:
-        ConfigError: for obstacles, and for actuators with a largest effort if the model is to run alone.
+        ConfigError: for obstacles, for drives that stretch, and for actuators with a largest effort if the model is to
+            run alone.
     """
     if robot.obstacles or type(robot).own_obstacles is not Robot.own_obstacles:
         raise ConfigError(
@@ -388,6 +389,11 @@ def check_learnable(robot: Robot, config: FitConfig) -> None:
         raise ConfigError(
             f"robot '{robot.name}': a surrogate would drive {', '.join(limited)} beyond max_effort: leave it out and "
             "check efforts afterwards, or set alone = false for backend='hybrid'"
+        )
+    if stretching := [drive.name for drive in robot.build().constraints["a"] if drive.compliance]:
+        raise ConfigError(
+            f"robot '{robot.name}': the drives of {', '.join(stretching)} stretch, which a surrogate does not learn: "
+            "use backend='fem', or leave compliance out"
         )
 
 

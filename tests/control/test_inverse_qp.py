@@ -11,6 +11,7 @@ from softgym_envs.control import InverseQP, PICorrection
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.extensions.deployment import EmbeddedLoop
 from softgym_envs.extensions.grasping import ContactQP
+from softgym_envs.mechanics import ModelBuilder, Section, Statics
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.solvers.complementarity import solve_complementarity
 
@@ -478,3 +479,44 @@ def test_plants_in_a_batch_get_the_commands_that_they_get_alone(rng):
     alone = [r.controller().solve(r.model, goal, r.command, r.slack) for r, goal in zip(robots, goals, strict=True)]
     assert np.ptp(together, axis=0).min() > 1e-6  # the plants differ
     np.testing.assert_allclose(together, alone, atol=1e-9 * 0.02)
+
+
+@pytest.fixture
+def stretching_rod():
+    """A rod with two tendons, of which one stretches by about as much as it moves the rod, and the other less."""
+    discs = np.linspace(0.0, 0.2, 11)
+    builder = ModelBuilder()
+    path = [[0, 0, 0], [0, 0, 0.2]]
+    builder.add_rod(path, section=Section.circle(0.5e-3), elements=discs, young_modulus=6e10, density=6450)
+    model = builder.build()
+    for name, side, compliance in (("left", -1.0, 1e-3), ("right", 1.0, 2e-4)):
+        model.add_tendon(name, discs[1:], [side * 0.0045, 0.0], compliance=compliance)
+    model.add_effector("tip", model.rods[0].points(0.2, (0.0, 0.0), model.nodes))
+    return Statics(model)
+
+
+def test_the_model_at_the_drives_is_the_derivative_by_the_commands(stretching_rod):
+    command, step = np.array([0.003, 0.0005]), 1e-6
+    condensed = stretching_rod.solve(command).condensed
+    drives = condensed.at_drives
+    np.testing.assert_allclose(drives.delta.a, command, atol=1e-12)
+    np.testing.assert_array_equal(drives.delta.e, condensed.delta.e)
+    slopes = []
+    for k in range(2):
+        ends = [stretching_rod.solve(command + side * step * np.eye(2)[k]).condensed.delta.e for side in (1, -1)]
+        slopes.append((ends[0] - ends[1]) / (2.0 * step))
+    expected = drives.W.ea @ np.linalg.inv(drives.W.aa)
+    np.testing.assert_allclose(np.array(slopes).T, expected, atol=1e-5 * np.abs(expected).max())
+
+
+def test_it_knows_how_drives_stretch(stretching_rod):
+    goal = stretching_rod.solve([0.006, 0.0015]).condensed.delta.e
+    sideways = np.array([1.0, 0.0, 0.0])
+    limits = np.full(2, -0.01), np.full(2, 0.01), np.full(2, 0.001)
+    controller = InverseQP(*limits, np.ones(2, dtype=bool), goal_weights=sideways)
+    command = np.zeros(2)
+    for _ in range(20):
+        state = stretching_rod.solve(command)
+        command = controller.solve(state.condensed, goal, command, state.slack)
+    assert abs(goal[0]) > 3e-3
+    assert abs(stretching_rod.solve(command).condensed.delta.e - goal)[0] < 1e-6

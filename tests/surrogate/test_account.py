@@ -6,6 +6,7 @@ import pytest
 
 from softgym_envs import make_robot
 from softgym_envs.errors import ConfigError
+from softgym_envs.robots.soft_finger import SoftFinger
 from softgym_envs.surrogate.training import FitConfig, account, generate_datasets
 
 SPLIT = {"groups": 2, "states": 2}
@@ -18,9 +19,19 @@ def config(robot, **options):
     )
 
 
+class StretchingFinger(SoftFinger):
+    """A finger with a cable that stretches."""
+
+    def assemble(self, design):
+        model = super().assemble(design)
+        model.constraints["a"][0].compliance = 1e-4
+        return model
+
+
 @pytest.mark.parametrize(
     ("wanted", "message"),
     [
+        (config(f"{__name__}:StretchingFinger"), "the drives of cable_1 stretch, which a surrogate does not learn"),
         (
             config("finger", robot_options={"obstacles": [PLANE]}),
             "'finger' touches obstacles, which a surrogate",

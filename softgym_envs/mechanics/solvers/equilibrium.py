@@ -90,24 +90,29 @@ class RowLayout:
         bonds: number of bond rows.
         slack_tolerance: by how much more than commanded a taut actuator may be displaced, by round-off [m, m3, ...],
             shape (n_a,).
+        stretch: how far the drives of actuators stretch per effort, shape (n_a,); 0 if all are rigid.
     """
 
     roles: Roles
     labels: tuple[Row, ...]
     bonds: int
     slack_tolerance: np.ndarray
+    stretch: np.ndarray | float
 
     @classmethod
     def of(cls, model: MechanicalModel) -> RowLayout:
         """Return the layout of a model's rows."""
         groups = [group for letter, group in model.constraints.items() if letter != "b"]
         # A volume changes by the motion of the nodes times an area.
-        slopes = [np.abs(c.jacobian(model.nodes)).sum(axis=1) for c in model.constraints["a"]]
+        actuators = model.constraints["a"]
+        slopes = [np.abs(c.jacobian(model.nodes)).sum(axis=1) for c in actuators]
+        stretches = np.concatenate([np.zeros(0), *(np.full(c.size, c.compliance) for c in actuators)])
         return cls(
             roles=tuple(role for role in model.roles if role[0] != "b"),
             labels=tuple(row for group in groups for c in group for row in c.rows()),
             bonds=dict(model.roles).get("b", 0),
             slack_tolerance=ROUND_OFF * np.concatenate([np.zeros(0), *slopes]).clip(max=1.0),
+            stretch=stretches if stretches.any() else 0.0,
         )
 
     def slack(
@@ -166,7 +171,8 @@ class RowLayout:
             W = W[:count, :count] - W[:count, count:] @ np.linalg.solve(W[count:, count:], W[count:, :count])
             if symmetric:
                 W = 0.5 * (W + W.T)
-        condensed = CondensedModel(W, delta[:count] - W @ effort[:count], effort[:count], self.roles, self.labels)
+        free = delta[:count] - W @ effort[:count]
+        condensed = CondensedModel(W, free, effort[:count], self.roles, self.labels, self.stretch)
         return Equilibrium(
             x, condensed, delta, effort, slack, stable, iterations, increments, contacts, memory, conditions
         )
