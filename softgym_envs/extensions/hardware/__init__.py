@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from softgym_envs.extensions.hardware.device import Device as Device
     from softgym_envs.extensions.hardware.device import HardwareError as HardwareError
     from softgym_envs.extensions.hardware.device import Reading as Reading
-    from softgym_envs.extensions.hardware.serving import emulated as emulated
+    from softgym_envs.extensions.hardware.simulated_time import emulated_bench as emulated_bench
 
 __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
@@ -23,6 +23,6 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "backend": ["HardwareBackend"],
         "bench": ["Bench", "BenchConfig"],
         "device": ["Device", "HardwareError", "Reading"],
-        "serving": ["emulated"],
+        "simulated_time": ["emulated_bench"],
     },
 )

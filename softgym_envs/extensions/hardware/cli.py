@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,10 +14,12 @@ from softgym_envs.cli.environments import AGENT_HELP, environment_of_agents
 from softgym_envs.extras import require
 
 if TYPE_CHECKING:
-    from softgym_envs.extensions.hardware.bench import BenchConfig
+    from softgym_envs.extensions.hardware.bench import Bench, BenchConfig
 
 BENCH = click.argument("bench", type=options.PATH)
-EMULATE = click.option("--emulate", is_flag=True, help="Drive an emulation of the bench in place of its ports.")
+EMULATE = click.option(
+    "--emulate", is_flag=True, help="Drive an emulation of the bench, in simulated time, in place of its ports."
+)
 
 
 @click.group(cls=options.Verbs)
@@ -30,17 +31,19 @@ def _load(bench: Path, overrides: tuple[str, ...]) -> BenchConfig:
     from softgym_envs.config import load_config
     from softgym_envs.extensions.hardware.bench import BenchConfig
 
-    require("hardware")
     return load_config(bench, BenchConfig, overrides)
 
 
-@contextlib.contextmanager
-def _ports(config: BenchConfig, emulate: bool) -> Any:
-    """Yield a bench with its own ports, or with those of an emulation."""
-    from softgym_envs.extensions.hardware.serving import emulated
+def _open(config: BenchConfig, emulate: bool) -> Bench:
+    """Return a bench with its own ports, or an emulation of it."""
+    if emulate:
+        from softgym_envs.extensions.hardware.simulated_time import emulated_bench
 
-    with emulated(config) if emulate else contextlib.nullcontext(config) as found:
-        yield found
+        return emulated_bench(config)
+    from softgym_envs.extensions.hardware.bench import Bench
+
+    require("hardware")
+    return Bench.open(config)
 
 
 @hardware.command()
@@ -50,9 +53,7 @@ def _ports(config: BenchConfig, emulate: bool) -> Any:
 @options.overrides
 def check(bench: Path, emulate: bool, as_json: bool, overrides: tuple[str, ...]) -> None:
     """Find all drives and say what they and the tracker measure. Nothing gets power or moves."""
-    from softgym_envs.extensions.hardware.bench import Bench
-
-    with _ports(_load(bench, overrides), emulate) as config, Bench.open(config) as found:
+    with _open(_load(bench, overrides), emulate) as found:
         reading = found.device.connect()
         found.clock.wait(found.clock.now() + 0.2)
         seen = None if found.tracker is None else found.tracker()
@@ -106,12 +107,12 @@ def run(
     """
     from softgym_envs.agents.evaluation import check_agent, make_agent
     from softgym_envs.extensions.hardware.backend import HardwareBackend
-    from softgym_envs.extensions.hardware.bench import Bench
 
     check_agent(agent)
     wanted, act = environment_of_agents("hardware run", (agent,), "hardware", id=environment), make_agent(agent, seed)
     scale, results = wanted.task_class.distance_scale, []
-    with _ports(_load(bench, overrides), emulate) as config, Bench.open(config) as found:
+    config = _load(bench, overrides)
+    with _open(config, emulate) as found:
         given: dict[str, Any] = {"bench": found, "log": None if log is None else str(log), "trial": trial}
         env = wanted.make(backend_options=given, design=config.design or None)
         body: Any = env.unwrapped
@@ -149,13 +150,13 @@ def emulate(
     bench: Path, backend: str, plant: tuple[str, ...], lost: float, latency: float, overrides: tuple[str, ...]
 ) -> None:
     """Serve an emulation of the bench on pseudo-terminals until Ctrl-C, for a program of yours."""
-    import threading
+    from softgym_envs.extensions.hardware.serving import serve
 
-    from softgym_envs.extensions.hardware.serving import emulated
+    config = _load(bench, overrides)
 
-    given = {"backend": backend, "plant": options.design_of(plant), "losses": {"lost": lost}, "latency": latency}
-    with emulated(_load(bench, overrides), **given) as config:
-        click.echo(f"{config.device}.port={config.settings.port}")
+    def ready(port: str, tracker: str) -> None:
+        click.echo(f"{config.device}.port={port}")
         if config.tracker is not None:
-            click.echo(f"tracker.port={config.tracker.port}")
-        threading.Event().wait()
+            click.echo(f"tracker.port={tracker}")
+
+    serve(config, ready, backend=backend, plant=options.design_of(plant), losses={"lost": lost}, latency=latency)

@@ -1,7 +1,6 @@
 """Benches without hardware: servos and boards that speak the real protocols, with a simulated body behind them.
 
-They run behind pseudo-terminals in a process of their own (`softgym hardware emulate`), or in a test that moves the
-time.
+They run behind pseudo-terminals (`softgym hardware emulate`), or in simulated time (`--emulate`).
 """
 
 from __future__ import annotations

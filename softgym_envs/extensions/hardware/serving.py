@@ -1,33 +1,20 @@
-"""Emulated benches in a process of their own, behind pseudo-terminals that take the place of serial ports."""
+"""Emulated benches in real time, behind pseudo-terminals that take the place of serial ports."""
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import select
-from collections.abc import Iterator
-from contextlib import contextmanager
-from multiprocessing.connection import Connection
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from softgym_envs.envs.plant import Plant
-from softgym_envs.errors import ConfigError
 from softgym_envs.extensions.hardware.bench import BenchConfig
-from softgym_envs.extensions.hardware.device import Clock, HardwareError
-from softgym_envs.extensions.hardware.dynamixel import DynamixelConfig
-from softgym_envs.extensions.hardware.emulation import (
-    Emulated,
-    EmulatedPressureBoard,
-    EmulatedServoBus,
-    Losses,
-    SimulatedBody,
-)
-from softgym_envs.extensions.hardware.pressure_board import PressureBoardConfig
+from softgym_envs.extensions.hardware.device import Clock
+from softgym_envs.extensions.hardware.emulation import Emulated, Losses, SimulatedBody
+from softgym_envs.extensions.hardware.simulated_time import make_emulated
 
 TRACKER_RATE = 100.0
 """Positions that are sent per second."""
-PATIENCE = 600.0
-"""Time that the process of an emulation has to start, the compilation of kernels included [s]."""
 
 
 class PseudoTerminal:
@@ -54,38 +41,35 @@ class PseudoTerminal:
         os.close(self._slave)
 
 
-def make_emulated(config: BenchConfig, body: SimulatedBody, losses: Losses | None = None) -> Any:
-    """Return the emulated device of a bench, which moves a body.
+def serve(
+    config: BenchConfig,
+    ready: Callable[[str, str], None],
+    *,
+    backend: str = "surrogate",
+    plant: Mapping[str, Any] | None = None,
+    losses: Mapping[str, Any] | None = None,
+    latency: float = 0.0,
+) -> None:
+    """Serve an emulated bench until Ctrl-C.
 
-    Raises:
-        ConfigError: for a device of which there is no emulation.
+    Args:
+        config: the bench that is emulated.
+        ready: called with the paths of the device and of the tracker once they answer.
+        backend: physics of the body.
+        plant: how it differs from its model, arguments of `Plant`.
+        losses: what the line does, arguments of `Losses`.
+        latency: age of the positions that the tracker sends [s].
     """
-    settings = config.settings
-    if isinstance(settings, DynamixelConfig):
-        return EmulatedServoBus(body, settings, losses)
-    if isinstance(settings, PressureBoardConfig):
-        channels = [settings.channels[actuator.name] for actuator in body.robot.actuators]
-        return EmulatedPressureBoard(body, channels, max(channels) + 1, settings.max_pressure, losses)
-    raise ConfigError(f"device '{config.device}' has no emulation; allowed: dynamixel, pressure_board")
-
-
-def serve(config: BenchConfig, options: dict[str, Any], pipe: Connection) -> None:
-    """Serve an emulated bench until the other end of a pipe is closed; sends the paths of its ports first."""
-    body = SimulatedBody(
-        config.make_robot(),
-        config.design,
-        backend=options.get("backend", "surrogate"),
-        plant=Plant(**options.get("plant", {})),
-        latency=options.get("latency", 0.0),
-    )
-    device: Emulated = make_emulated(config, body, Losses(**options.get("losses", {})))
+    robot = config.make_robot()
+    body = SimulatedBody(robot, config.design, backend=backend, plant=Plant(**(plant or {})), latency=latency)
+    device: Emulated = make_emulated(config, body, Losses(**(losses or {})))
     line, tracker, clock = PseudoTerminal(), PseudoTerminal(), Clock()
     device.move(clock.now())  # compiles what it needs
-    pipe.send((line.path, tracker.path))
+    ready(line.path, tracker.path)
     next_position = clock.now()
     try:
-        while not pipe.poll():
-            select.select([line.master, pipe.fileno()], [], [], max(next_position - clock.now(), 0.0))
+        while True:
+            select.select([line.master], [], [], max(next_position - clock.now(), 0.0))
             try:
                 data = os.read(line.master, 4096)
             except BlockingIOError:
@@ -96,41 +80,8 @@ def serve(config: BenchConfig, options: dict[str, Any], pipe: Connection) -> Non
                 next_position = max(next_position + 1.0 / TRACKER_RATE, clock.now())
                 positions = " ".join(f"{value:.7f}" for value in body.seen(clock.now()).ravel().tolist())
                 tracker.write(f"{positions}\n".encode())
-    except (KeyboardInterrupt, EOFError):
+    except KeyboardInterrupt:
         pass
     finally:
         line.close()
         tracker.close()
-
-
-@contextmanager
-def emulated(config: BenchConfig, **options: Any) -> Iterator[BenchConfig]:
-    """Yield a bench whose ports are those of an emulation in another process, which ends with the block.
-
-    Args:
-        config: the bench that is emulated.
-        **options: ``backend`` of the body, ``plant`` and ``losses`` as mappings, ``latency`` of the tracker [s].
-
-    Raises:
-        HardwareError: if the emulation does not start.
-    """
-    context = multiprocessing.get_context("spawn")
-    ours, theirs = context.Pipe()
-    process = context.Process(target=serve, args=(config, options, theirs), daemon=True)
-    process.start()
-    theirs.close()
-    try:
-        try:
-            if not ours.poll(PATIENCE):
-                raise HardwareError(f"the emulation did not start within {PATIENCE:g} s")
-            port, tracker = ours.recv()
-        except EOFError:
-            raise HardwareError("the emulation did not start; see the error above") from None
-        settings = config.settings.model_copy(update={"port": port})
-        seen = {} if config.tracker is None else {"tracker": config.tracker.model_copy(update={"port": tracker})}
-        yield config.model_copy(update={"settings": settings, **seen})
-    finally:
-        ours.close()
-        process.join(5.0)
-        if process.is_alive():
-            process.terminate()

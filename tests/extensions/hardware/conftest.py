@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 import select
 
-import numpy as np
 import pytest
 
 from softgym_envs.extensions.hardware.bench import Bench, BenchConfig
-from softgym_envs.extensions.hardware.device import DEVICES, Clock, HardwareError, SerialLine
+from softgym_envs.extensions.hardware.device import DEVICES, HardwareError, SerialLine
 from softgym_envs.extensions.hardware.emulation import Losses, SimulatedBody
-from softgym_envs.extensions.hardware.serving import PseudoTerminal, make_emulated
+from softgym_envs.extensions.hardware.serving import PseudoTerminal
+from softgym_envs.extensions.hardware.simulated_time import BYTE, SeenBody, SimulatedClock, make_emulated
 
 FINGER = {
     "robot": "finger",
@@ -24,21 +24,6 @@ FINGER = {
         },
     },
 }
-BYTE = 10 / 1_000_000
-"""Time of a byte at 1 Mbaud [s]."""
-
-
-class MovedClock(Clock):
-    """A clock that stands still until somebody waits, and wakes late by exponentially distributed times."""
-
-    def __init__(self, late=0.0, seed=0):
-        self.time, self.late, self._random = 100.0, late, np.random.default_rng(seed)
-
-    def now(self):
-        return self.time
-
-    def wait(self, until):
-        self.time = max(self.time, until) + (self._random.exponential(self.late) if self.late else 0.0)
 
 
 class PumpedLine(SerialLine):
@@ -78,26 +63,13 @@ class PumpedLine(SerialLine):
         return data
 
 
-class SeenBody:
-    """A tracker that sees the simulated body."""
-
-    def __init__(self, body, clock):
-        self.body, self.clock = body, clock
-
-    def __call__(self):
-        return self.body.seen(self.clock.now())
-
-    def close(self):
-        pass
-
-
 class MovedBench:
     """A bench with an emulated device, and what is behind it."""
 
     def __init__(self, config, *, backend="surrogate", plant=None, losses=None, late=0.0, latency=0.0, tracker=True):
         self.config = BenchConfig.model_validate(config)
         robot = self.config.make_robot()
-        self.clock, self.losses = MovedClock(late), losses or Losses()
+        self.clock, self.losses = SimulatedClock(late), losses or Losses()
         self.body = SimulatedBody(robot, backend=backend, plant=plant, latency=latency)
         self.emulated = make_emulated(self.config, self.body, self.losses)
         self.terminal = PseudoTerminal()
