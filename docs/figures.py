@@ -27,7 +27,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from softgym_envs.codesign.config import StudyConfig
+from softgym_envs.config import load_config
 from softgym_envs.errors import DataError
+from softgym_envs.units import display
 from softgym_envs.wording import decimal
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -98,10 +101,18 @@ def figure(record: str, name: str, form: str = "") -> str:
     return number({"min": min, "max": max}.get(how["pick"], min)(values), how["form"])
 
 
+def drives(study: str) -> str:
+    """Return how far the drives of a study's robot go, and whether it has weight."""
+    robot = load_config(ROOT / "configs" / "codesign" / f"{study}.yaml", StudyConfig).robot
+    shown = [(actuator, display(actuator.unit)) for actuator in robot.actuators]
+    ends = dict.fromkeys(f"{actuator.high * factor:g} {name}" for actuator, (name, factor, _) in shown)
+    return f"drives to {' and '.join(ends)}{'' if any(robot.gravity) else ', no weight'}".replace(" ", "\u00a0")
+
+
 def headlines() -> str:
     """Studies: mean distance to the test goals on FEM, from the baseline to the winner, and on a finer mesh."""
     lines = [
-        "| robot; controller | baseline | winner | change, 95% | study's → finer mesh | command |",
+        "| robot; controller; drives | baseline | winner | change, 95% | study's → finer mesh | command |",
         "| --- | --: | --: | --: | --: | --- |",
     ]
     for key in HEADLINES:
@@ -116,7 +127,7 @@ def headlines() -> str:
             checked = "\u00a0→\u00a0".join(decimal(finer[f"change{when} [mm]"], 2) for when in (" before", ""))
             checked += "\u00a0mm"
         cells = [
-            f"{study['title']}; {row['controller'].partition(',')[0]}",
+            f"{study['title']}; {row['controller'].partition(',')[0]}; {drives(key)}",
             f"{ends[0]}\u00a0mm",
             f"→\u00a0{ends[1]}\u00a0mm",
             f"{low:.1f}\u00a0to\u00a0{high:.1f}\u00a0mm",
