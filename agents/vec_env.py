@@ -11,20 +11,18 @@ from stable_baselines3.common.vec_env import VecEnv
 
 
 class SB3VecEnv(VecEnv):
-    """Adapter from a `gymnasium.vector.VectorEnv` with same-step autoreset to a stable-baselines3 `VecEnv`.
+    """Adapter from a `gymnasium.vector.VectorEnv`, in any autoreset mode, to a stable-baselines3 `VecEnv`.
+
+    Episodes that end are reset in the same step, as stable-baselines3 expects it: by the environment, or, if it would
+    do so in the next step or not at all, by the option ``reset_mask``.
 
     Options of `set_options` hold for one episode, as for stable-baselines3's own environments. A body for the whole
     training is an option ``design`` of the environment.
-
-    Raises:
-        ValueError: for other autoreset modes, whose resets stable-baselines3 would count as steps.
     """
 
     def __init__(self, env: VectorEnv) -> None:
-        mode = env.metadata.get("autoreset_mode")
-        if mode != AutoresetMode.SAME_STEP:
-            raise ValueError(f"autoreset_mode = {mode} cannot be adapted; allowed: {AutoresetMode.SAME_STEP}")
         self.env = env
+        self._same_step = env.metadata.get("autoreset_mode") == AutoresetMode.SAME_STEP
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
         self._actions: np.ndarray | None = None
         self._seed: int | None = None
@@ -54,6 +52,8 @@ class SB3VecEnv(VecEnv):
     def _infos(self, info: dict[str, Any]) -> list[dict[str, Any]]:
         """Return the present values of each sub-environment."""
         names = [name for name in info if not name.startswith(("_", "final_"))]
+        if not names:
+            return [{} for _ in range(self.num_envs)]
         return [dict(zip(names, row, strict=True)) for row in zip(*(info[name] for name in names), strict=True)]
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
@@ -70,10 +70,15 @@ class SB3VecEnv(VecEnv):
         self._length += 1
         infos = self._infos(info)
         ended = np.flatnonzero(done)
-        final = self._infos(info["final_info"]) if len(ended) else []
+        final, last = infos, observation
+        if len(ended) and self._same_step:
+            final, last = self._infos(info["final_info"]), info["final_obs"]
+        elif len(ended):
+            last = observation.copy()
+            observation, _ = self.env.reset(options={"reset_mask": done})
         for i in ended:
             infos[i] = final[i] | {
-                "terminal_observation": info["final_obs"][i],
+                "terminal_observation": last[i],
                 "TimeLimit.truncated": bool(truncated[i] and not terminated[i]),
                 "episode": {"r": float(self._return[i]), "l": int(self._length[i])},
             }

@@ -2,6 +2,7 @@
 
 import json
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -122,10 +123,38 @@ def test_ends_are_as_far_from_the_goals_as_the_distances_say(agent):
 def test_tasks_that_read_states_run_one_environment_at_a_time():
     grasp = EnvironmentConfig(id="SoftGym/FingerGrasp-v0", backend="surrogate")
     assert not grasp.batched and EnvironmentConfig(id="SoftGym/FingerReach-v0").batched
-    envs = SB3VecEnv(grasp.make_vec(1))  # refuses environments that reset themselves a step late
+    envs = SB3VecEnv(grasp.make_vec(1))
     envs.reset()
     _, rewards, done, infos = envs.step(np.ones((1, 1), dtype=np.float32))
     assert rewards.shape == done.shape == (1,) and infos[0]["distance"] == 1.0
+
+
+@pytest.mark.parametrize("kind", ["NextStep", "Disabled", "sync"])
+def test_stable_baselines_sees_the_same_episodes_in_every_autoreset_mode(kind):
+    """Whatever resets the environments, and whenever: the last observation, its information and the next episode."""
+    options = {"max_episode_steps": 4}
+    whole = gymnasium.make_vec("SoftGym/FingerReach-v0", 3, **options)
+    if kind == "sync":  # Gymnasium's own, which resets in the next step
+        other = gymnasium.make_vec("SoftGym/FingerReach-v0", 3, vectorization_mode="sync", **options)
+    else:
+        other = gymnasium.make_vec("SoftGym/FingerReach-v0", 3, autoreset_mode=kind, **options)
+    pair = [SB3VecEnv(whole), SB3VecEnv(other)]
+    for envs in pair:
+        envs.seed(3)
+    np.testing.assert_allclose(*(envs.reset() for envs in pair), atol=1e-6)
+    rng, ended = np.random.default_rng(0), 0
+    for _ in range(10):
+        actions = rng.uniform(-1.0, 1.0, (3, 2)).astype(np.float32)
+        (seen, reward, done, infos), (*others, other_infos) = (envs.step(actions) for envs in pair)
+        for one, two in zip((seen, reward, done), others, strict=True):
+            np.testing.assert_allclose(two, one, atol=1e-6)
+        for i in np.flatnonzero(done):
+            one, two = infos[i], other_infos[i]
+            np.testing.assert_allclose(two["terminal_observation"], one["terminal_observation"], atol=1e-6)
+            assert two["episode"] == pytest.approx(one["episode"]) and two["TimeLimit.truncated"]
+            assert two["distance"] == pytest.approx(one["distance"], abs=1e-9)
+            ended += 1
+    assert ended == 6
 
 
 @pytest.mark.parametrize("agent", ["finger_reach", "qp", "random"])
