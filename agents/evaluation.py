@@ -20,6 +20,9 @@ from softgym_envs.executors import parallel_map
 if TYPE_CHECKING:
     import gymnasium
 
+SETTLED = 20
+"""Last steps of an episode over which distances are averaged where a body swings about its goal."""
+
 Bodies = Mapping[str, float] | Sequence[Mapping[str, float]] | None
 """The body of all episodes, one for each, or None for that of the environment."""
 
@@ -42,6 +45,8 @@ class Evaluation:
         steps: environment steps.
         untrusted: share of the steps of each episode that ended in a state which is not to be trusted (``trusted`` of
             ``info``), shape (n,); NaN if it is not known.
+        settled_distances: mean of the distance over the last `SETTLED` steps of each episode [m], shape (n,); NaN if it
+            is not known.
         largest_efforts: largest effort of any actuator in any step of each episode [N, ...], shape (n,); NaN if it is
             not known.
         tallies: what the task counts (`Task.tallies`), at the end of each episode [SI], each of shape (n,).
@@ -58,6 +63,7 @@ class Evaluation:
     steps: int
     untrusted: np.ndarray | None = None
     largest_efforts: np.ndarray | None = None
+    settled_distances: np.ndarray | None = None
     tallies: dict[str, np.ndarray] = field(default_factory=dict)
     seconds: float = 0.0
     cpu_seconds: float = 0.0
@@ -169,7 +175,7 @@ def _column(values: Any) -> np.ndarray:
     return found.astype(float) if found.dtype == object else found
 
 
-_LATER = ("untrusted", "largest_efforts")
+_LATER = ("untrusted", "largest_efforts", "settled_distances")
 """Columns that older files do not have."""
 _PER_GOAL = ("distances", "tracking_distances", "returns", "successes", "efforts", "ends", *_LATER)
 _SUMMARY = (
@@ -368,20 +374,22 @@ def _evaluate_one_by_one(
 def _run_episode(env: gymnasium.Env, act: Agent, seed: int, options: dict[str, Any]) -> dict[str, Any]:
     """Return what `Evaluation` says of one episode, by the names of its columns, and its steps."""
     observation, info = env.reset(seed=seed, options=options)
-    total, effort, largest, distance, untrusted, steps, ended = 0.0, 0.0, 0.0, 0.0, 0, 0, False
+    total, effort, largest, untrusted, ended = 0.0, 0.0, 0.0, 0, False
+    distances: list[float] = []
     inner: Any = env.unwrapped
     while not ended:
         observation, reward, terminated, truncated, info = env.step(act(observation, inner))
         total += float(reward)
         efforts = env.unwrapped.robot.effort_sizes(info["effort"])  # type: ignore[attr-defined]
         effort, largest = effort + float(efforts.mean()), max(largest, float(efforts.max()))
-        distance += info["distance"]
+        distances.append(float(info["distance"]))
         untrusted += not info["trusted"]
-        steps += 1
         ended = terminated or truncated
+    steps = len(distances)
     return {
         "distances": info["distance"],
-        "tracking_distances": distance / steps,
+        "tracking_distances": sum(distances) / steps,
+        "settled_distances": float(np.mean(distances[-SETTLED:])),
         "returns": total,
         "successes": bool(info["is_success"] and info["converged"]),
         "efforts": effort / steps,
@@ -405,6 +413,7 @@ def _evaluate_together(
     else:
         act = Policy(agent).begin()
     distances, totals, returns, efforts, largest, untrusted, lengths = np.zeros((7, count))
+    recent = np.full((SETTLED, count), np.nan)
     successes, running, ends = np.zeros(count, dtype=bool), np.ones(count, dtype=bool), np.zeros((count, 3))
     tallies = {name: np.zeros(count) for name in env.unwrapped.task.tallies}
     try:
@@ -417,6 +426,7 @@ def _evaluate_together(
             for name, values in tallies.items():
                 values[running] = last[name][running]
             totals += running * last["distance"]
+            recent[lengths[running].astype(int) % SETTLED, running] = last["distance"][running]
             returns += running * reward
             effort = env.unwrapped.robot.effort_sizes(last["effort"])
             efforts += running * effort.mean(axis=1)
@@ -435,6 +445,7 @@ def _evaluate_together(
         ends=ends,
         untrusted=untrusted / lengths,
         largest_efforts=largest,
+        settled_distances=np.nanmean(recent, axis=0),
         tallies=tallies,
         steps=int(lengths.sum()),
     )

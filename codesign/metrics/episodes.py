@@ -41,6 +41,12 @@ def mean_tracking_distance(outcome: Outcome) -> np.ndarray:
     return outcome.evaluation.tracking_distances
 
 
+@metric("distance", over_path=True)
+def mean_settled_distance(outcome: Outcome) -> np.ndarray | None:
+    """Return the mean distance to the goal over the last 20 steps of each episode, about which a body may swing."""
+    return outcome.evaluation.settled_distances
+
+
 @metric("effort", label="Mean actuator effort", over_path=True)
 def mean_effort(outcome: Outcome) -> np.ndarray:
     """Return the mean size of the efforts over actuators and steps of each episode."""

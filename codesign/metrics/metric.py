@@ -206,6 +206,7 @@ TYPICAL = Display("% of the typical effort", 100.0, 0)
 
 _NAMES = (
     *("success_rate", "mean_distance", "mean_return", "mean_tracking_distance", "mean_effort"),
+    "mean_settled_distance",
     *("largest_effort", "untrusted_share", "material_volume"),
     *("walking_speed", "walking_drift", "walking_slip", "cost_of_transport"),
 )

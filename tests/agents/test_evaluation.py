@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from softgym_envs.agents.config import EnvironmentConfig
-from softgym_envs.agents.evaluation import Evaluation, evaluate, make_agent, sample_goals
+from softgym_envs.agents.evaluation import SETTLED, Evaluation, evaluate, make_agent, sample_goals
 from softgym_envs.agents.vec_env import SB3VecEnv
 from softgym_envs.errors import DataError
 
@@ -53,7 +53,7 @@ def test_files_hold_everything(evaluation):
 
 def test_files_from_before_trust_and_largest_efforts_were_recorded_can_be_read():
     data = some(3, 0).to_json()
-    for name in ("untrusted", "largest_efforts"):
+    for name in ("untrusted", "largest_efforts", "settled_distances"):
         assert data.pop(name) == [None, None, None]
         assert np.isnan(getattr(Evaluation.from_json(data), name)).all()
     distances = data["mean_distances"] = data.pop("tracking_distances")  # its earlier name
@@ -77,6 +77,23 @@ def test_largest_efforts_are_those_of_any_actuator_in_any_step(backend):
         means.append(np.mean(efforts))
     np.testing.assert_allclose(found.largest_efforts, largest, rtol=1e-3)
     np.testing.assert_allclose(found.efforts, means, rtol=1e-3)
+
+
+@pytest.mark.parametrize("backend", ["surrogate", "fem"])  # together and one by one
+def test_settled_distances_are_means_over_the_last_steps(backend):
+    steps = SETTLED + 3
+    environment = EnvironmentConfig(id="SoftGym/FingerReach-v0", backend=backend, max_episode_steps=steps)
+    goals = sample_goals(environment, 2, seed=0)
+    env, act, expected = environment.make(), make_agent("qp"), []
+    for goal in goals:
+        observation, _ = env.reset(seed=0, options={"goal": goal})
+        distances = []
+        for _ in range(steps):
+            observation, _, _, _, info = env.step(act(observation, env.unwrapped))
+            distances.append(info["distance"])
+        expected.append(np.mean(distances[-SETTLED:]))
+    found = evaluate("qp", environment, goals).settled_distances
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-7)
 
 
 def test_untrusted_states_are_counted():
