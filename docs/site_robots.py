@@ -142,8 +142,8 @@ def robot_sections(name: str) -> dict[str, Callable[[], str]]:
         return facts + text
 
     def weights() -> str:
-        if robot.learning.parts and has_surrogate(name):
-            return f"A learned {robot.learning.parts[0]} ships, of which its surrogate consists."
+        if has_surrogate(name) and "surrogate" in robot.backends:
+            return "Its surrogate consists of learned parts, which ship."
         if has_surrogate(name):
             return f"Weights of a surrogate ship for the default options (`{robot.learning.weights}`)."
         return "With the default options no surrogate ships that environments run on: they run on finite elements."

@@ -6,19 +6,32 @@ episode before they answer.
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from softgym_envs.backends.backend import Backend, State, refuse_force
+from softgym_envs.backends.backend import Backend, PointForce, Snapshot, State, refuse_force
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.robots.base import Robot
+
+
+class Command(NamedTuple):
+    """A control step.
+
+    Attributes:
+        values: of the actuators, shape (n_a,).
+        mode: ``"displacement"`` or ``"effort"``.
+        touch: what touches the body.
+    """
+
+    values: np.ndarray
+    mode: str
+    touch: PointForce | None
 
 
 class Followed(NamedTuple):
@@ -27,12 +40,12 @@ class Followed(NamedTuple):
     Attributes:
         learned: the last state that the learned model found.
         fem: the last state of the finite elements; None at rest.
-        path: commands and modes since then.
+        path: commands since then.
     """
 
     learned: State
     fem: State | None
-    path: tuple[tuple[np.ndarray, str], ...]
+    path: tuple[Command, ...]
 
 
 class PathHybridBackend(Backend):
@@ -50,8 +63,10 @@ class PathHybridBackend(Backend):
     robot: Robot
     learned: Backend
 
-    def _start(self, robot: Robot, learned: Backend) -> None:
-        self.robot, self.learned = robot, learned
+    def _start(self, robot: Robot, learned: Backend, **fem_options: Any) -> None:
+        self._fem_options = fem_options
+        self.robot, self.learned, self.takes_touch = robot, learned, learned.takes_touch
+        self._touch: PointForce | None = None
         self.calls = self.fem_calls = 0
         self._fem: FEMBackend | None = None
         self.design = None  # type: ignore[assignment]  # until the first reset
@@ -71,19 +86,24 @@ class PathHybridBackend(Backend):
                     raise
                 rest = replace(fem, memory=Followed(learned, fem, ()))
             self._rest, self.design = rest, complete
-        self.state = self._rest
+        self.state, self._touch = self._rest, None
         return self.state
+
+    def touch(self, load: PointForce | None) -> None:
+        if load is not self._touch:
+            self.learned.touch(load)
+            self._touch = load
 
     def step(self, command: np.ndarray, mode: str = "displacement", *, force: np.ndarray | None = None) -> State:
         refuse_force(force)
         known = self._known
         self.calls += 1
-        self.learned.restore(known.learned)
+        self._go_to(known.learned)
         try:
             learned, found = self.learned.step(command, mode), True
         except ConvergenceError:
             learned, found = known.learned, False
-        path = (*known.path, (np.array(command, dtype=float), mode))
+        path = (*known.path, Command(np.array(command, dtype=float), mode, self._touch))
         if found and learned.trusted:
             self.state = replace(learned, memory=Followed(learned, known.fem, path))
         else:
@@ -95,7 +115,7 @@ class PathHybridBackend(Backend):
         """Return the equilibrium under a command without going there."""
         known = self._known
         self.calls += 1
-        self.learned.restore(known.learned)
+        self._go_to(known.learned)
         try:
             found = self.learned.probe(command, mode)
         except ConvergenceError:
@@ -103,13 +123,14 @@ class PathHybridBackend(Backend):
         if found is not None and found.trusted:
             return found
         fem = self._follow(known.fem, known.path)
+        fem.touch(self._touch)
         self.fem_calls += 1
         return fem.probe(command, mode)
 
     def contact_model(self, *, friction: bool = False) -> CondensedModel:
         known = self._known
         if known.path or known.fem is None:
-            self.learned.restore(known.learned)
+            self._go_to(known.learned)
             return self.learned.contact_model(friction=friction)
         return self._follow(known.fem, ()).contact_model(friction=friction)
 
@@ -128,9 +149,9 @@ class PathHybridBackend(Backend):
         assert isinstance(self.state.memory, Followed)
         return self.state.memory
 
-    @abstractmethod
     def _finite_elements(self, design: Design) -> FEMBackend:
-        """Return the finite elements for a body."""
+        """Return the finite elements for a body, on the mesh that its parts were learned from."""
+        return FEMBackend(self.robot.learned_mesh(), design, **self._fem_options)
 
     def _fem_of(self, design: Design) -> FEMBackend:
         """Return the finite elements of a body, which are built, and solved at rest, when they are first needed."""
@@ -142,12 +163,26 @@ class PathHybridBackend(Backend):
             self.fem_calls += 1
         return self._fem
 
-    def _follow(self, start: State | None, path: tuple[tuple[np.ndarray, str], ...]) -> FEMBackend:
+    def _go_to(self, state: State) -> None:
+        """Bring the learned model to a state of it, under what touches the body now."""
+        if self.takes_touch:
+            self.learned.touch(self._touch)
+        self.learned.restore(state)
+
+    def _extra_state(self) -> PointForce | None:
+        return self._touch
+
+    def _resume(self, snapshot: Snapshot) -> None:
+        super()._resume(snapshot)
+        self.touch(snapshot.extra)
+
+    def _follow(self, start: State | None, path: tuple[Command, ...]) -> FEMBackend:
         """Return the finite elements of the present body after commands from a state, or from rest."""
         # A copy or another episode may have left them at another body.
         fem = self._fem_of(self.design)
         fem.restore(fem.reset() if start is None else start)
-        for command, mode in path:
+        for command, mode, touch in path:
+            fem.touch(touch)
             fem.step(command, mode)
             self.fem_calls += 1
         return fem

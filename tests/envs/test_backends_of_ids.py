@@ -16,11 +16,6 @@ HOLES = {
     # Contact with the ground is not learned.
     ("SoftGym/QuadrupedWalk-v0", "surrogate"): GROUND,
     ("SoftGym/QuadrupedWalk-v0", "hybrid"): GROUND,
-    # Its ensemble cannot learn readings of sensors between episodes.
-    ("SoftGym/SensorizedFingerReach-v0", "hybrid"): "no weights ship for 'sensorized_finger_2cavities'",
-    # Modules are learned parts themselves: its finite elements have six unknowns for each of them.
-    ("SoftGym/ModularReach-v0", "surrogate"): "beyond their max_effort .*; use backend='fem'",
-    ("SoftGym/ModularReach-v0", "hybrid"): "no weights ship for 'modular_arm': use backend='fem'",
 }
 """What a user is told who asks for what there is not, by ID and backend."""
 

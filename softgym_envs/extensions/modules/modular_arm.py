@@ -116,6 +116,10 @@ class ModularArm(Robot):
     effectors = ("tip",)
     size = 0.1
     learning = Learning(stiffness_variable="young_modulus")
+    backends = {
+        "surrogate": "softgym_envs.extensions.modules.backends:ModularBackend",
+        "hybrid": "softgym_envs.extensions.modules.backends:ModularHybridBackend",
+    }
 
     def __init__(
         self,
@@ -213,9 +217,16 @@ class ModularArm(Robot):
         shares = dict(zip(SHAPES[module].dimensions, ("length", "width", "depth"), strict=True))
         return {d: low + design[f"{shares[d]}_{number}"] * (high - low) for d, (low, high) in box.items()}
 
-    def printable(self) -> ModularArm:
-        options: dict[str, Any] = {**self._options, "body": "solid"}
+    def with_body(self, body: str) -> ModularArm:
+        """Return the arm with another ``body``."""
+        options: dict[str, Any] = {**self._options, "body": body}
         return ModularArm(**options)
+
+    def printable(self) -> ModularArm:
+        return self.with_body("solid")
+
+    def learned_mesh(self) -> ModularArm:
+        return self.with_body("solid")
 
     def _height(self, design: Mapping[str, float]) -> float:
         return sum(part.length for part in self._modules(design))

@@ -105,6 +105,7 @@ class SensorizedFinger(GmshRobot):
     """
 
     name = "sensorized_finger"
+    backends = {"hybrid": "softgym_envs.extensions.sensing.hybrid:SensorizedHybridBackend"}
     effectors: tuple[str, ...] = ("tip",)
     size = 0.12
     rounded = True
