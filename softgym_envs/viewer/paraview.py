@@ -16,12 +16,12 @@ from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Robot
 from softgym_envs.storage import atomic_write
 from softgym_envs.viewer.moment import Moment
-from softgym_envs.viewer.surface import BodySurface, ShapeFinder, cable_lines, surface_kinds
+from softgym_envs.viewer.surface import BodySurface, ShapeFinder, cable_lines, chamber_skins, surface_kinds
 
 if TYPE_CHECKING:
     import pyvista
 
-PARTS = {"volume": "vtu", "skin": "vtp", "cables": "vtp", "points": "vtp", "contacts": "vtp"}
+PARTS = {"volume": "vtu", "skin": "vtp", "cables": "vtp", "chambers": "vtp", "points": "vtp", "contacts": "vtp"}
 """Series of a folder, with the kind of their files; a part that a robot does not have is left out."""
 
 
@@ -33,6 +33,7 @@ class ParaviewWriter:
     * ``volume``: the solids, deformed, with ``displacement`` [m] from the mesh as built and number of the ``solid``;
     * ``skin``: surface of solids, beams and rigid parts, with ``kind``: 0 body, 1 clamped, 2 rigid object;
     * ``cables``: with ``effort`` [N], ``displacement`` [m] and ``slack`` of each;
+    * ``chambers``: walls of the cavities, each with its ``pressure`` [Pa]; NaN where it is not known;
     * ``points``: effectors (``kind`` 0) and goal (1), with the field data ``effort``, ``displacement``, ``reward``;
     * ``contacts``: where obstacles press, with ``force`` [N] and ``gap`` [m].
 
@@ -80,6 +81,8 @@ class ParaviewWriter:
         self._write("skin", step, self._skin(x))
         if lines := cable_lines(model, x, state, stub=0.0):
             self._write("cables", step, _cables(lines, state))
+        if chambers := chamber_skins(model, x):
+            self._write("chambers", step, self._chambers(chambers, state))
         self._write("points", step, _points(state, moment.goal, moment.reward))
         if state.contacts is not None:
             touch = state.contacts
@@ -98,6 +101,17 @@ class ParaviewWriter:
         mesh = pyvista.PolyData.from_regular_faces(self._surface.points(x), self._surface.triangles)
         mesh.cell_data["kind"] = surface_kinds(self._surface)
         return mesh
+
+    def _chambers(self, skins: Mapping[str, tuple[np.ndarray, np.ndarray]], state: State) -> pyvista.PolyData:
+        import pyvista
+
+        efforts = {actuator.name: effort for actuator, effort in zip(self.robot.actuators, state.effort, strict=True)}
+        parts = []
+        for name, skin in skins.items():
+            mesh = pyvista.PolyData.from_regular_faces(*skin)
+            mesh.cell_data["pressure"] = np.full(mesh.n_cells, efforts.get(name, np.nan))
+            parts.append(mesh)
+        return parts[0].append_polydata(*parts[1:])
 
 
 def _text(mesh: pyvista.DataSet) -> str:

@@ -18,7 +18,7 @@ from softgym_envs.robots.base import Robot
 from softgym_envs.storage import atomic_write
 from softgym_envs.units import display, effort_unit
 from softgym_envs.viewer.moment import Moment, Watcher
-from softgym_envs.viewer.scene import COLORS, STUB, tension_color
+from softgym_envs.viewer.scene import COLORS, STUB, effort_color
 from softgym_envs.viewer.surface import BodySurface, ShapeFinder, cable_lines
 
 Agent = Callable[[np.ndarray, SoftRobotEnv], np.ndarray]
@@ -121,7 +121,7 @@ class RolloutRecorder:
         lines = cable_lines(model, x, state, stub=STUB * size)
         for row, line in lines.items():
             share = state.effort[row] / self.robot.effort_scale[row]
-            color = COLORS["cable slack"] if state.slack[row] else tension_color(share)
+            color = COLORS["cable slack"] if state.slack[row] else effort_color("cable", share)
             strip = rerun.LineStrips3D([line], radii=0.008 * size, colors=color)
             self._stream.log(f"{self._root}world/cables/{self.robot.actuators[row].name}", strip)
         effectors = rerun.Points3D(state.effector, radii=0.026 * size, colors=COLORS["effector"])

@@ -13,7 +13,7 @@ from softgym_envs.extras import require
 from softgym_envs.mechanics.contact.obstacles import Plane
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Robot
-from softgym_envs.viewer.surface import BodySurface, cable_lines, surface_kinds
+from softgym_envs.viewer.surface import BodySurface, cable_lines, chamber_skins, surface_kinds
 
 if TYPE_CHECKING:
     import pyvista
@@ -33,6 +33,8 @@ COLORS: dict[str, Color] = {
     "cable low": (245, 166, 35),
     "cable high": (205, 30, 45),
     "cable slack": (98, 106, 122),
+    "chamber low": (190, 205, 225),
+    "chamber high": (70, 60, 170),
     "effector": (35, 95, 205),
     "goal": (20, 165, 90),
     "text": (75, 82, 95),
@@ -62,12 +64,12 @@ def check_display() -> None:
         )
 
 
-def tension_color(share: float) -> Color:
-    """Return the colour of a taut cable whose effort is ``share`` of its scale."""
+def effort_color(part: str, share: float) -> Color:
+    """Return the colour of a taut ``"cable"`` or of a ``"chamber"`` whose effort is ``share`` of its scale."""
     share = float(np.clip(share, 0.0, 1.0))
     red, green, blue = (
         round((1.0 - share) * low + share * high)
-        for low, high in zip(COLORS["cable low"], COLORS["cable high"], strict=True)
+        for low, high in zip(COLORS[f"{part} low"], COLORS[f"{part} high"], strict=True)
     )
     return red, green, blue
 
@@ -199,6 +201,7 @@ class Scene:
         self._obstacles = _Part(self, "object", back=True, opacity=0.55, open_surface=True)
         self._edges = _Part(self, "edge", lit=False, opacity=0.35, line_width=1.2 * self._line)
         self._cables: dict[int, _Part] = {}
+        self._chambers: dict[str, _Part] = {}
         self._trail = _Part(self, "goal", lit=False, opacity=0.8, line_width=2.5 * self._line, faint=0.3)
         self._goal = _Part(self, "goal", specular=0.4, faint=0.5)
         self._effectors = _Part(self, "effector", specular=0.4, faint=0.5)
@@ -366,7 +369,7 @@ class Scene:
         self._ghost.show(mesh)
 
     def set_state(self, x: np.ndarray, state: State) -> None:
-        """Draw cables and effectors of the current body at node positions [m] (n, 3) in a state."""
+        """Draw cables, chambers and effectors of the current body at node positions [m] (n, 3) in a state."""
         assert self._model is not None
         side = self._side @ self._axes
         lines = cable_lines(self._model, x, state, stub=STUB * self._length, side=tuple(side))
@@ -376,14 +379,34 @@ class Scene:
             if row not in self._cables:
                 self._cables[row] = _Part(self, "cable low", specular=0.3, faint=0.45)
             slack = bool(state.slack[row])
-            color = COLORS["cable slack"] if slack else tension_color(state.effort[row] / self.robot.effort_scale[row])
+            share = state.effort[row] / self.robot.effort_scale[row]
+            color = COLORS["cable slack"] if slack else effort_color("cable", share)
             radius = (0.006 if slack else 0.009) * self._length
             line = self._seen(line)
             tube = _polyline(line).tube(radius=radius, n_sides=12, capping=True)
             tube.point_data.active_normals = tube.point_data["TubeNormals"]
             bead = self._balls(line[:1], 0.018 * self._length)
             self._cables[row].show(tube.append_polydata(bead), color)
+        self._draw_chambers(x, state)
         self._effectors.show(self._balls(self._seen(state.effector), 0.026 * self._length))
+
+    def _draw_chambers(self, x: np.ndarray, state: State) -> None:
+        """Let the walls of cavities shine through the body, the darker the higher their pressure."""
+        import pyvista
+
+        assert self._model is not None
+        skins = chamber_skins(self._model, x)
+        rows = {actuator.name: row for row, actuator in enumerate(self.robot.actuators)}
+        for name in self._chambers.keys() - skins.keys():
+            self._chambers[name].show(None)
+        for name, (points, triangles) in skins.items():
+            if name not in self._chambers:
+                self._chambers[name] = _Part(self, "chamber low", opacity=0.0, faint=0.45)
+            mesh = pyvista.PolyData.from_regular_faces(self._seen(points), triangles)
+            mesh = mesh.compute_normals(cell_normals=False, split_vertices=True)
+            row = rows.get(name)
+            share = 0.0 if row is None else state.effort[row] / self.robot.effort_scale[row]
+            self._chambers[name].show(mesh, effort_color("chamber", share))
 
     def set_goal(self, goal: np.ndarray | None, path: np.ndarray | None) -> None:
         """Draw the goal [m] (3,) and, if it moves, its path [m] (p, 3); None hides them."""

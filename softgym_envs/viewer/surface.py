@@ -12,6 +12,7 @@ from softgym_envs.backends.backend import State
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError
+from softgym_envs.mechanics.constraints.cavity import Cavity
 from softgym_envs.mechanics.elements.tetrahedra import boundary_triangles
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Robot
@@ -124,6 +125,17 @@ def cable_lines(
             lines[row] = np.vstack([end, slacken(path, state.displacement[row] - pulled[row], side)])
         row += constraint.size
     return lines
+
+
+def chamber_skins(model: MechanicalModel, x: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Return the walls of cavities, actuators and sensors, by name: points [m] (p, 3) and triangles (t, 3)."""
+    skins = {}
+    for role in ("a", "s"):
+        for constraint in model.constraints.get(role, ()):
+            if isinstance(constraint, Cavity):
+                nodes, triangles = np.unique(constraint.flat_triangles, return_inverse=True)
+                skins[constraint.name] = x[nodes], triangles.reshape(-1, 3)
+    return skins
 
 
 def commanded_displacement(state: State) -> np.ndarray:

@@ -13,7 +13,7 @@ from softgym_envs.errors import ConvergenceError
 from softgym_envs.viewer.image import ImageRenderer, render_bodies, render_body
 from softgym_envs.viewer.moment import Moment
 from softgym_envs.viewer.recording import RolloutRecorder, record_rollout
-from softgym_envs.viewer.scene import COLORS, tension_color
+from softgym_envs.viewer.scene import COLORS, effort_color
 from softgym_envs.viewer.surface import BodySurface, ShapeFinder, cable_lines, slacken
 
 SIZE = (160, 120)
@@ -198,9 +198,9 @@ class TestShape:
         assert length - taut == pytest.approx(0.001, rel=0.1)
         np.testing.assert_array_equal(wave[[0, -1]], path[[0, -1]])
 
-    def test_tension_color(self):
-        assert tension_color(-1.0) == COLORS["cable low"]
-        assert tension_color(2.0) == COLORS["cable high"]
+    def test_effort_color(self):
+        assert effort_color("cable", -1.0) == COLORS["cable low"]
+        assert effort_color("cable", 2.0) == COLORS["cable high"]
 
 
 @pytest.fixture(scope="module")
