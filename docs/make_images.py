@@ -57,15 +57,18 @@ MODULE_MOTIONS = {
     "accordion": (2, 0.008),
 }
 """Component of `softgym_envs.extensions.modules.base.POSE` and value, for the picture of each module."""
+WITHOUT_REST = ("swimmer",)
+"""Robots that have no equilibrium; their films show them."""
 WIDTH, HEIGHT = 800, 520
 SHOWN = ("finger_reach", "trunk_track", "gripper_lift")
 """Environments of the animation of the home page."""
 FILM_SIZE, FILM_FRAMES = (360, 300), 30
 FILM_AGENTS = {
-    "finger_grasp": "force", "gripper_lift": "close", "quadruped_walk": "gait", "tetrapod_carry": "tetrapod_carry",
+    "finger_grasp": "force", "gripper_lift": "close", "quadruped_walk": "gait", "swimmer_swim": "gait",
+    "tetrapod_carry": "tetrapod_carry",
 }  # fmt: skip
 """Agents of the films of environments, where it is not the inverse QP."""
-FILM_STEPS = {"gripper_lift": 50, "quadruped_walk": 100, "tetrapod_carry": 60}
+FILM_STEPS = {"gripper_lift": 50, "quadruped_walk": 100, "swimmer_swim": 100, "tetrapod_carry": 60}
 OPTIONS: dict[str, dict[str, Any]] = {
     "finger_grasp": {"backend": "fem", "robot_options": {"object": "hexagon"}},  # easier to see than a plane
     "modular_reach": {"backend": "fem", "robot_options": {"body": "solid"}},  # superelements are drawn as bars
@@ -183,7 +186,7 @@ def main(names: list[str]) -> None:
     table: dict[str, Callable[[], np.ndarray]] = {"arm": draw_arm, "grasp": draw_grasp}
     table |= {"modules": draw_modules}
     table |= {"benchmark_regret": plots.draw_regret, "benchmark_winners": plots.draw_winners}
-    table |= {name: partial(draw_robot, name) for name in ROBOTS}
+    table |= {name: partial(draw_robot, name) for name in ROBOTS if name not in WITHOUT_REST}
     films = [f"{name}.webp" for name in environment_pages()]
     every = [*table, *films, "episodes"]
     if unknown := [name for name in names if name not in (*every, "report")]:

@@ -68,24 +68,24 @@ def untrusted_share(outcome: Outcome) -> np.ndarray | None:
 def _tally(outcome: Outcome, name: str) -> np.ndarray:
     found = outcome.evaluation.tallies.get(name)
     if found is None:
-        raise ValueError(f"metrics of walking need episodes of task 'walk', which count '{name}'")
+        raise ValueError(f"this metric needs episodes of a task that counts '{name}', such as walk")
     return found
 
 
 @metric("m/s", "maximize")
-def walking_speed(outcome: Outcome) -> np.ndarray:
+def forward_speed(outcome: Outcome) -> np.ndarray:
     """Return the speed ahead."""
     return _tally(outcome, "speed")
 
 
 @metric()
-def walking_drift(outcome: Outcome) -> np.ndarray:
+def relative_drift(outcome: Outcome) -> np.ndarray:
     """Return the way sideways over the way ahead."""
     return _tally(outcome, "drift") / np.maximum(_tally(outcome, "speed"), SLOWEST)
 
 
 @metric()
-def walking_slip(outcome: Outcome) -> np.ndarray:
+def relative_slip(outcome: Outcome) -> np.ndarray:
     """Return the way on which loaded points slip over the way ahead."""
     return _tally(outcome, "slip") / np.maximum(_tally(outcome, "speed"), SLOWEST)
 
@@ -94,6 +94,8 @@ def walking_slip(outcome: Outcome) -> np.ndarray:
 def cost_of_transport(outcome: Outcome) -> np.ndarray:
     """Return the work of the actuators over weight and way ahead."""
     weight = outcome.model.mass * float(np.linalg.norm(outcome.robot.gravity))
+    if weight == 0.0:
+        raise ValueError(f"cost_of_transport needs a robot with weight; '{outcome.robot.name}' has none (gravity = 0)")
     return _tally(outcome, "power") / (weight * np.maximum(_tally(outcome, "speed"), SLOWEST))
 
 

@@ -208,7 +208,7 @@ _NAMES = (
     *("success_rate", "mean_distance", "mean_return", "mean_tracking_distance", "mean_effort"),
     "mean_settled_distance",
     *("largest_effort", "untrusted_share", "material_volume"),
-    *("walking_speed", "walking_drift", "walking_slip", "cost_of_transport"),
+    *("forward_speed", "relative_drift", "relative_slip", "cost_of_transport"),
 )
 METRICS: Mapping[str, Metric] = _Metrics(
     "metric",

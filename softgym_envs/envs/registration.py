@@ -107,6 +107,7 @@ ENVIRONMENTS: dict[str, EnvironmentRow] = {
         robot_options={"mesh": "accurate", "servo_range": 2.8},
     ),
     "SoftGym/QuadrupedWalk-v0": environment_row("quadruped", "walk", 100, backend="fem", backend_options=DYNAMIC),
+    "SoftGym/SwimmerSwim-v0": environment_row("swimmer", "swim", 100, backend="fem", backend_options=DYNAMIC),
 }
 """All environments of a robot with a task, by ID; `register_environment` and installed packages add to them."""
 

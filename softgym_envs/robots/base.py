@@ -208,6 +208,14 @@ class Robot(ABC):
             f"robot '{self.name}' has no reference path: define reference_path, or pass task_options={{'path': points}}"
         )
 
+    def place(self, nodes: np.ndarray) -> np.ndarray:
+        """Return where a robot that moves about is [m], shape (3,): the origin of its `body_frame`.
+
+        Args:
+            nodes: positions of all rows of the model [m], shape (n, 3).
+        """
+        return nodes[self.body_frame]
+
     def reference_gait(self) -> np.ndarray:
         """Return the commands of one period of a plain gait, one for each control step, shape (p, n_a).
 

@@ -1,8 +1,8 @@
 """The swimmer: a soft, tapered body in a viscous fluid, bent by pairs of fibre-reinforced chambers beside its axis.
 
 Nothing holds it, and it weighs nothing in the fluid. It swims along x, head first. The design is our own: the fluid is
-glycerine, in which a body of this size and speed meets no inertia of the fluid (its Reynolds number is below one), so
-that resistive force theory holds.
+silicone oil, in which inertia of the fluid does not count at this size and speed (the Reynolds number of its sideways
+strokes is below 0.3), so that resistive force theory holds.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ CORNERS = 12
 """Corners of the sections that are drawn."""
 PERIOD = 20
 """Control steps of a period of the plain gait."""
-STROKE = 1.0e-8
+STROKE = 3.5e-8
 """Volume by which its chambers change [m3]."""
 
 
@@ -44,7 +44,7 @@ class Swimmer(Robot):
 
     Args:
         elements: quadratic beam elements of a segment; the tail has as many.
-        viscosity: of the fluid [Pa s]; 1 is glycerine.
+        viscosity: of the fluid [Pa s].
         gravity: acceleration beyond what the fluid carries [m/s2].
         **options: options of `Robot`.
     """
@@ -55,14 +55,15 @@ class Swimmer(Robot):
     made_of_beams = True
     goal_axes = np.array([1.0, 1.0, 0.0])
     goal_tolerance = 0.01
-    view = View(axes=(2, 0, 1))
+    mirrored_actuators = tuple(k ^ 1 for k in range(2 * SEGMENTS))
+    view = View(axes=(2, 0, 1), at_rest=True, way=0.2)
     workspace_scale = 0.04
 
     def __init__(
         self,
         *,
         elements: int = 1,
-        viscosity: float = 1.0,
+        viscosity: float = 3.0,
         gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
         **options: Any,
     ) -> None:
@@ -72,21 +73,22 @@ class Swimmer(Robot):
         if not (np.isfinite(viscosity) and viscosity > 0.0):
             raise ValueError(f"viscosity = {viscosity} Pa s must be finite and positive")
         self.elements = elements
+        self.body_frame = 4 * ((SEGMENTS + 1) * elements)
         self.viscosity = float(viscosity)
         self.design_space = DesignSpace(
             DesignVariable("length", 0.100, 0.200, 0.150, "m", "length of the body"),
-            DesignVariable("radius", 0.005, 0.008, 0.006, "m", "radius of the head"),
-            DesignVariable("taper", 0.7, 1.0, 0.8, "1", "radius of the end of the tail over that of the head"),
+            DesignVariable("radius", 0.0065, 0.009, 0.007, "m", "radius of the head"),
+            DesignVariable("taper", 0.8, 1.0, 0.9, "1", "radius of the end of the tail over that of the head"),
             DesignVariable("tail", 0.1, 0.5, 0.2, "1", "part of the length without chambers"),
-            DesignVariable("young_modulus", 5.0e4, 5.0e5, 1.5e5, "Pa", "stiffness of the silicone", log=True),
+            DesignVariable("young_modulus", 5.0e4, 5.0e5, 1.0e5, "Pa", "stiffness of the silicone", log=True),
         )
         self.effector_rest = np.zeros(3)
         self.actuators = tuple(
-            Actuator(f"{k + 1}_{side}", -1.2e-8, 1.2e-8, 4.0e-9, unit="m3", unilateral=False)
+            Actuator(f"{k + 1}_{side}", -5.0e-8, 5.0e-8, 1.5e-8, unit="m3", unilateral=False)
             for k in range(SEGMENTS)
             for side in ("left", "right")
         )
-        self.effort_scale = np.full(len(self.actuators), 5.0e3)
+        self.effort_scale = np.full(len(self.actuators), 3.0e4)
 
     def assemble(self, design: Mapping[str, float]) -> MechanicalModel:
         """Lay the body along x with its middle at the origin."""
@@ -100,12 +102,12 @@ class Swimmer(Robot):
         builder = ModelBuilder(gravity=self.gravity, floating=True)
         # From head to tail: the first director runs backwards, the second one to the left.
         turn = np.column_stack([[-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]])
-        frames = [builder.add_frame((0.5 * length - place, 0.0, 0.0), turn) for place in places]
         radii = radius * (1.0 - (1.0 - taper) * places / length)
         sections = [Section.circle(r) for r in radii[1::order]]
+        frames = [builder.add_frame((0.5 * length - place, 0.0, 0.0), turn) for place in places]
         drag = slender_drag(self.viscosity, length, 0.5 * radius * (1.0 + taper))
         builder.add_beam(
-            frames, section=sections, young_modulus=design["young_modulus"], poisson_ratio=0.45, density=1260.0,
+            frames, section=sections, young_modulus=design["young_modulus"], poisson_ratio=0.45, density=970.0,
             drag=drag,
         )  # fmt: skip
         model = builder.build()
@@ -122,6 +124,12 @@ class Swimmer(Robot):
         circle = np.column_stack([np.cos(angles), np.sin(angles)])
         model.skins.append(tube_skin(beam, model.nodes, radii[:, None, None] * circle))
         return model
+
+    def place(self, nodes: np.ndarray) -> np.ndarray:
+        """Return the centroid of the axis [m], shape (3,): the middle swings, the centroid hardly does."""
+        axis = nodes[::4]
+        lengths = np.linalg.norm(np.diff(axis, axis=0), axis=1)
+        return lengths @ (0.5 * (axis[:-1] + axis[1:])) / lengths.sum()
 
     def reference_gait(self) -> np.ndarray:
         """A wave of one length of the body that runs from head to tail, shape (20, 8)."""

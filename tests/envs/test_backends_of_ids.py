@@ -16,6 +16,9 @@ HOLES = {
     # Contact with the ground is not learned.
     ("SoftGym/QuadrupedWalk-v0", "surrogate"): GROUND,
     ("SoftGym/QuadrupedWalk-v0", "hybrid"): GROUND,
+    # Nothing holds it, so it has no equilibria to learn.
+    ("SoftGym/SwimmerSwim-v0", "surrogate"): "no weights ship for 'swimmer'",
+    ("SoftGym/SwimmerSwim-v0", "hybrid"): "no weights ship for 'swimmer'",
 }
 """What a user is told who asks for what there is not, by ID and backend."""
 

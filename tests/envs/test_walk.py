@@ -132,14 +132,14 @@ def test_metrics_read_the_evaluation(walk):
     stored = Evaluation.from_json(found.to_json())
     outcome = Outcome(stored, config.make_robot().design_space.baseline, config.make_robot())
     values = {
-        name: METRICS[name].measure(outcome).value for name in ("walking_speed", "walking_slip", "cost_of_transport")
+        name: METRICS[name].measure(outcome).value for name in ("forward_speed", "relative_slip", "cost_of_transport")
     }
-    assert values["walking_speed"] == pytest.approx(found.tallies["speed"].mean())
-    assert 0.0 < values["walking_slip"] < 0.3
+    assert values["forward_speed"] == pytest.approx(found.tallies["speed"].mean())
+    assert 0.0 < values["relative_slip"] < 0.3
     assert 0.1 < values["cost_of_transport"] < 2.0
     still = Evaluation.from_json(found.to_json() | {"tallies": {}})
-    with pytest.raises(ValueError, match="need episodes of task 'walk'"):
-        METRICS["walking_speed"].measure(Outcome(still, {}, config.make_robot()))
+    with pytest.raises(ValueError, match="needs episodes of a task that counts 'speed'"):
+        METRICS["forward_speed"].measure(Outcome(still, {}, config.make_robot()))
 
 
 def test_vector_environments_walk_alike():
