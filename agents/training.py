@@ -7,7 +7,7 @@ import json
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypedDict
+from typing import TYPE_CHECKING, Any, Protocol, TypedDict
 
 import numpy as np
 
@@ -24,8 +24,6 @@ from softgym_envs.wording import counted
 
 if TYPE_CHECKING:
     from stable_baselines3 import SAC
-
-    from softgym_envs.agents.joint import DesignProposer
 
 
 EVALUATION_SEED = 1_000_003
@@ -50,6 +48,22 @@ class CurvePoint(TypedDict):
     mean_distance: float
     worst_distance: float
     mean_return: float
+
+
+class DesignProposer(Protocol):
+    """Draws the bodies of training episodes, and learns along with the policy; for the learner ``"sac"``."""
+
+    def attach(self, model: SAC, config: TrainConfig, folder: Path) -> None:
+        """Start drawing the bodies of a training, continuing where an interrupted run stopped."""
+
+    def begin(self, model: SAC) -> None:
+        """Prepare for the next part of the training."""
+
+    def save(self, step: int) -> None:
+        """Write what is needed to continue from ``step``."""
+
+    def finish(self, model: SAC) -> None:
+        """Write the most promising bodies."""
 
 
 def train(

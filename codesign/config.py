@@ -9,14 +9,12 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from softgym_envs.agents.joint import PROPOSERS
 from softgym_envs.agents.learners import LEARNERS
 from softgym_envs.codesign.parts import (
     PRUNERS,
     STRATEGIES,
     FinalistsConfig,
     GoalsConfig,
-    JointConfig,
     PrunerConfig,
     ScreenConfig,
     Strategy,
@@ -49,11 +47,9 @@ class StudyConfig(StudyProblem):
         constraints: largest allowed values of objectives that are minimised, smallest of those that are maximised [SI];
             a body that violates one cannot win.
         strategy: how bodies are scored. ``"policy"``: by one shared policy. ``"warm_start"``: each trial
-            fine-tunes that policy. ``"scratch"``: each trial trains a policy (plain nesting). ``"critic"`` and
-            ``"distribution"``: bodies and a policy are trained together, then that policy scores every body. ``"qp"``:
-            by the inverse QP, without training.
+            fine-tunes that policy. ``"scratch"``: each trial trains a policy (plain nesting). ``"qp"``: by the
+            inverse QP, without training.
         policy: shared policy, for ``"policy"`` and ``"warm_start"``: a file or the name of a shipped one.
-        joint: training of bodies and policy together, for ``"critic"`` and ``"distribution"``.
         trials: number of bodies, the baseline and those of the screen included.
         workers: number of workers with one thread each.
         executor: what workers are: ``"processes"`` of this machine, or tasks of a ``"ray"`` cluster.
@@ -72,9 +68,8 @@ class StudyConfig(StudyProblem):
         finalists: check on FEM.
     """
 
-    strategy: Literal["policy", "warm_start", "scratch", "critic", "distribution", "qp"] = "policy"
+    strategy: Literal["policy", "warm_start", "scratch", "qp"] = "policy"
     policy: Annotated[str | None, BesideConfig()] = None
-    joint: JointConfig = Field(default_factory=JointConfig)
     trials: int = Field(ge=1)
     workers: int = Field(default=1, ge=1)
     executor: Literal["processes", "ray"] = "processes"
@@ -120,16 +115,15 @@ class StudyConfig(StudyProblem):
             bool(self.secondary_objectives or self.constraints) and self.sampler.name == "cmaes",
             "sampler 'cmaes' supports neither secondary objectives nor constraints; allowed: tpe, gp, nsgaii",
         )
-        first = self.screen.kept + (self.joint.keep if self.plan.proposer else 0)
         refuse(
-            1 + first > self.trials,
-            f"trials = {self.trials} is too few for the baseline and {first} bodies found before the trials",
+            1 + self.screen.kept > self.trials,
+            f"trials = {self.trials} is too few for the baseline and {self.screen.kept} bodies found before the trials",
         )
         self._check_finalists()
         return self
 
     def _check_goals(self) -> None:
-        goals, row, trains = self.goals, self.environment.row, self.plan.trains or self.plan.proposer
+        goals, row, trains = self.goals, self.environment.row, self.plan.trains
         refuse(
             goals.source == "family" and not self.environment.has_surrogate,
             f"goals.source = 'family' needs a surrogate: give the weights of robot '{row.robot}' as "
@@ -211,7 +205,7 @@ class StudyConfig(StudyProblem):
         refuse(not plan.policy and bool(self.policy), f"{strategy} does not use policy = '{self.policy}'; remove it")
         for name in filter(is_option, self.variables):
             refuse(
-                plan.policy or bool(plan.proposer),
+                plan.policy,
                 f"{strategy} uses a policy that was trained with fixed options, so '{name}' cannot vary; "
                 "allowed: qp, scratch",
             )
@@ -225,16 +219,6 @@ class StudyConfig(StudyProblem):
             f"{strategy} needs a policy that reads the design: add {', '.join(self.variables)} to "
             "environment.design_in_observation",
         )
-        if plan.proposer:
-            backend = self.environment.backend
-            refuse(
-                backend != "surrogate",
-                f"joint training does not run on environment.backend = '{backend}'; allowed: surrogate",
-            )
-            try:
-                PROPOSERS[plan.proposer](**self.joint.options)
-            except TypeError as error:
-                raise ValueError(f"joint.options: {error}") from None
 
     def _check_pruner(self) -> None:
         pruner, trains = self.pruner.name, self.plan.trains
@@ -256,19 +240,16 @@ class StudyConfig(StudyProblem):
     def _check_trainings(self) -> None:
         """Refuse trainings that would end before they report or learn anything."""
         own, retrained = self.plan.trains, self.finalists.seeds
-        runs: list[tuple[str, TrainingConfig]] = [("training", self.training)] * bool(own or retrained)
-        runs += [("joint", self.joint)] * bool(self.plan.proposer)
-        refuse(
-            bool(self.plan.proposer) and self.joint.learner != "sac",
-            f"joint.learner = {self.joint.learner} has no critic to propose bodies; allowed: sac",
-        )
-        for key, run in runs:
+        if own or retrained:
+            run = self.training
             refuse(
                 run.report_every > run.steps,
-                f"{key}.report_every = {run.report_every} exceeds {key}.steps = {run.steps}",
+                f"training.report_every = {run.report_every} exceeds training.steps = {run.steps}",
             )
-            known = run is self.joint or own or self.finalists.steps is None
-            run.check_training(self.environment, run.steps if known else None, section=f"{key}.", end=f"{key}.steps")
+            known = own or self.finalists.steps is None
+            run.check_training(
+                self.environment, run.steps if known else None, section="training.", end="training.steps"
+            )
         if retrained and self.finalists.steps is not None:
             self.training.check_training(
                 self.environment, self.finalists.steps, section="training.", end="finalists.steps"

@@ -20,22 +20,17 @@ class Strategy:
 
     trains: bool = False  # each trial trains a policy of its own
     policy: bool = False  # the study needs a given shared policy, to start trainings or to score bodies
-    proposer: str | None = (
-        None  # name in `softgym_envs.agents.joint.PROPOSERS` if bodies and a shared policy are trained together
-    )
 
     @property
     def shares_policy(self) -> bool:
-        """Whether a shared policy scores all bodies: the given one, or that of the joint training."""
-        return not self.trains and (self.policy or bool(self.proposer))
+        """Whether the given shared policy scores all bodies."""
+        return not self.trains and self.policy
 
 
 STRATEGIES: dict[str, Strategy] = {
     "scratch": Strategy(trains=True),
     "warm_start": Strategy(trains=True, policy=True),
     "policy": Strategy(policy=True),
-    "critic": Strategy(proposer="critic"),
-    "distribution": Strategy(proposer="distribution"),
     "qp": Strategy(),
 }
 """Registry: name to strategy."""
@@ -146,20 +141,6 @@ class TrainingConfig(LearnerConfig):
             update["task_options"] = {**environment.task_options, "goals": goals.tolist()}
         keys = self.model_dump(include=set(TrainConfig.model_fields))
         return TrainConfig(environment=environment.model_copy(update=update), **{**keys, **changes})
-
-
-class JointConfig(TrainingConfig):
-    """Training of bodies and policy together, before the trials; for the strategies ``"critic"``, ``"distribution"``.
-
-    The critic proposes bodies at each report.
-    """
-
-    steps: int = Field(default=40_000, ge=1)
-    report_every: int = Field(default=4_000, ge=1)
-    keep: int = Field(default=4, ge=1, le=32, description="number of the most promising bodies that become trials")
-    options: dict[str, int | float] = Field(
-        default_factory=dict, description="of the proposer, see softgym_envs.agents.joint"
-    )
 
 
 class ScreenConfig(Config):

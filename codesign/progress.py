@@ -62,7 +62,6 @@ class Progress:
         config = study.config
         phases = {
             "screen": config.screen.enabled,
-            "shared policy": bool(config.plan.proposer),
             "trials": True,
             "test": config.finalists.count > 0,
         }
@@ -75,7 +74,7 @@ class Progress:
         """Print the head of a phase.
 
         Args:
-            phase: ``"screen"``, ``"shared policy"``, ``"trials"`` or ``"test"``.
+            phase: ``"screen"``, ``"trials"`` or ``"test"``.
             text: what it does.
             total: number of its parts.
             done: how many of them were finished before.

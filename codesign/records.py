@@ -107,7 +107,7 @@ class TrialResult(StudyRecord, Score):
     REMEDY = RESTORE
 
     number: int
-    origin: str  # of its body: "baseline", "screen 3", "joint 0" or "sampler 7"
+    origin: str  # of its body: "baseline", "screen 3" or "sampler 7"
     process: str  # "host:pid" of the worker
     options: dict[str, float] = field(default_factory=dict)  # variables that are options, by their full names [SI]
     sampler_seed: int | None = None  # of the sampler that proposed the body, if one did
@@ -152,14 +152,9 @@ class ScreenResult(StudyRecord, Score):
 
 @dataclass(eq=False)
 class SharedPolicy(StudyRecord):
-    """The policy that scores every body, and what it cost."""
+    """The policy that scores every body."""
 
     policy: str  # its file, relative to the folder of the study
-    bodies: list[dict[str, float]] = field(default_factory=list)  # values [SI] of the best bodies of joint training
-    training_steps: int = 0
-    report_steps: int = 0  # environment steps of the points of the learning curve
-    seconds: float = 0.0  # wall-clock time [s]
-    cpu_seconds: float = 0.0
 
 
 @dataclass(eq=False)

@@ -20,7 +20,7 @@ from softgym_envs.codesign.metrics.metric import Metric
 from softgym_envs.codesign.metrics.sources import Outcome
 from softgym_envs.codesign.phases.finalists import check_tests, finalist_jobs
 from softgym_envs.codesign.phases.screen import kept_bodies, screen_jobs
-from softgym_envs.codesign.phases.shared_policy import promising_bodies, shared_policy_jobs
+from softgym_envs.codesign.phases.shared_policy import shared_policy_jobs
 from softgym_envs.codesign.progress import Progress
 from softgym_envs.codesign.records import Account, Job
 from softgym_envs.codesign.report.files import write_results
@@ -99,7 +99,7 @@ def run_study(
                 _run_screen(study, count, output)
         if shared_policy_jobs(study):
             with _timed(study, "shared_policy"):
-                _make_shared_policy(study, output)
+                _copy_shared_policy(study, output)
         with _timed(study, "trials"):
             _run_trials(study, count, output)
         if config.finalists.count:
@@ -203,18 +203,15 @@ def _run_screen(study: StudyFolder, workers: int, output: Progress) -> None:
     output.say(f"screen: kept {len(kept_bodies(study))} of {counted(len(jobs), 'body')}")
 
 
-def _make_shared_policy(study: StudyFolder, output: Progress) -> None:
+def _copy_shared_policy(study: StudyFolder, output: Progress) -> None:
     if missing := missing_jobs(study, shared_policy_jobs(study)):
-        if study.config.plan.proposer:
-            steps = study.config.joint.steps
-            output.begin("shared policy", f"bodies and policy are trained together, {steps:,} steps", 1)
         _run_jobs(study, output, "shared_policy", missing, 1)
 
 
 def _run_trials(study: StudyFolder, workers: int, output: Progress) -> None:
     config = study.config
     with TrialQueue(study) as queue:
-        queue.enqueue([("baseline", config.baseline_values), *promising_bodies(study), *kept_bodies(study)])
+        queue.enqueue([("baseline", config.baseline_values), *kept_bodies(study)])
         queue.mirror()
         output.trials(quiet=True)
         mirrored = time.monotonic()

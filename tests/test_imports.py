@@ -6,6 +6,7 @@ import ast
 import os
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -71,8 +72,10 @@ def package_of(module):
     return ".".join(parts[: 3 if parts[1:2] == ["extensions"] else 2]) if len(parts) > 1 else None
 
 
+@cache
 def imports_of(path):
-    """Modules of this project that a file imports, each with whether it happens inside a function only."""
+    """Modules of this project that a file imports, each with its line and whether it happens inside a function only."""
+    found = []
     tree = ast.parse(path.read_text())
     lazy = {
         id(node)
@@ -91,7 +94,8 @@ def imports_of(path):
             continue
         for name in names:
             if name.split(".")[0] in ("softgym_envs", "benchmarks", "studies"):
-                yield name, id(node) in lazy, node.lineno
+                found.append((name, id(node) in lazy, node.lineno))
+    return found
 
 
 def test_every_package_has_a_layer():
@@ -100,18 +104,20 @@ def test_every_package_has_a_layer():
     assert len(FILES) > 30
 
 
-@pytest.mark.parametrize("path", FILES, ids=module_name)
-def test_imports_go_downwards(path):
-    module = module_name(path)
-    here = package_of(module)
-    for name, lazy, line in imports_of(path):
-        there = package_of(name)
+def test_imports_go_downwards():
+    upwards = []
+    for path in FILES:
+        module = module_name(path)
+        here = package_of(module)
         if here is None:
             continue  # ``softgym_envs/__init__.py`` exports from several packages; a test below keeps it light
-        if there not in LEVEL or there == here:
-            continue
-        allowed = LEVEL[there] < LEVEL[here] or (lazy and (here, there) in LAZY)
-        assert allowed, f"{module}, line {line}: {here} must not import {name}"
+        for name, lazy, line in imports_of(path):
+            there = package_of(name)
+            if there not in LEVEL or there == here or (lazy and (here, there) in LAZY):
+                continue
+            if LEVEL[there] >= LEVEL[here]:
+                upwards.append(f"{module}, line {line}: {here} must not import {name}")
+    assert upwards == []
 
 
 def test_the_checker_detects_a_forbidden_import(tmp_path):
@@ -244,14 +250,14 @@ def test_no_circles():
     assert circles(import_graph(MODULES)) == []
 
 
-@pytest.mark.parametrize("path", MODULES.values(), ids=module_name)
-def test_names_with_an_underscore_stay_in_their_module(path):
-    assert list(private_imports(path)) == []
+def test_names_with_an_underscore_stay_in_their_module():
+    found = {module: list(private_imports(path)) for module, path in MODULES.items()}
+    assert {module: lines for module, lines in found.items() if lines} == {}
 
 
-@pytest.mark.parametrize("path", MODULES.values(), ids=module_name)
-def test_files_are_short(path):
-    assert len(path.read_text().splitlines()) <= MAX_LINES
+def test_files_are_short():
+    lines = {module: len(path.read_text().splitlines()) for module, path in MODULES.items()}
+    assert {module: count for module, count in lines.items() if count > MAX_LINES} == {}
 
 
 def test_the_checkers_detect_circles_and_private_names(tmp_path):

@@ -255,7 +255,7 @@ def _importance(snapshot: StudySnapshot) -> dict[str, float]:
 
 
 def _cost(snapshot: StudySnapshot) -> Cost:
-    config, trials, shared = snapshot.config, snapshot.trials, snapshot.shared_policy
+    config, trials = snapshot.config, snapshot.trials
     screened = [result.evaluation for result in snapshot.screen if result.evaluation is not None]
     # Of all bodies that ever were finalists, not only of the present ones.
     tests, retrained = snapshot.all_tests, snapshot.all_trainings
@@ -265,8 +265,6 @@ def _cost(snapshot: StudySnapshot) -> Cost:
         return sum(test.evaluation.steps for test in tests if test.backend in backends and test.evaluation is not None)
 
     return Cost(
-        joint_steps=shared.training_steps if shared else 0,
-        joint_report_steps=shared.report_steps if shared else 0,
         retraining_steps=sum(training.steps for training in retrained),
         retraining_report_steps=sum(training.report_steps for training in retrained),
         training_steps=sum(trial.training_steps for trial in trials),
@@ -277,7 +275,6 @@ def _cost(snapshot: StudySnapshot) -> Cost:
         test_steps_fem=test_steps("fem", REFINED),
         cpu_seconds={
             "screen": sum(evaluation.cpu_seconds for evaluation in screened),
-            "shared_policy": shared.cpu_seconds if shared else 0.0,
             "trials": sum(trial.cpu_seconds for trial in trials),
             "finalists": sum(test.evaluation.cpu_seconds for test in tests if test.evaluation is not None)
             + sum(training.cpu_seconds for training in retrained),

@@ -105,8 +105,6 @@ class Transfer(Record):
 class Cost(Record):
     """Environment steps of each part of a study, and its time by phase [s]."""
 
-    joint_steps: int
-    joint_report_steps: int
     retraining_steps: int
     retraining_report_steps: int
     training_steps: int

@@ -21,8 +21,6 @@ CONTROLLERS = {
     "warm_start": "a policy fine-tuned in each trial from a shared policy",
     "scratch": "a policy trained from scratch in each trial",
     "policy": "a shared policy: one for all bodies, which also reads the design",
-    "critic": "a shared policy, trained together with bodies that its critic proposes",
-    "distribution": "a shared policy, trained together with a distribution of bodies",
     "qp": "inverse QP on the condensed model, no training",
 }
 """What a strategy trains, in words."""
@@ -186,8 +184,6 @@ def _method(snapshot: StudySnapshot, results: StudyResults) -> list[tuple[str, s
     ]
     if config.plan.trains:
         rows.append(("Training", f"{config.training.steps:,} environment steps in each trial"))
-    if config.plan.proposer:
-        rows.append(("Training", f"{config.joint.steps:,} environment steps on many bodies, none in the trials"))
     rows.append(("Search", f"sampler {config.sampler.name}, pruner {config.pruner.name}"))
     if (screen := config.screen).enabled:
         scored = f"{counted(screen.candidates, 'body')} on {counted(screen.goals, 'goal')}"

@@ -292,10 +292,6 @@ def cost_rows(cost: Cost) -> list[CostRow]:
     )
     parts = {
         "screen": ("Screen by the inverse QP", f"{cost.screen_steps:,}"),
-        "shared_policy": (
-            "Bodies and policy together",
-            f"{cost.joint_steps:,} of training, {cost.joint_report_steps:,} of its reports",
-        ),
         "trials": (
             "Trials",
             f"{cost.training_steps:,} of training, {cost.report_steps:,} of its reports, {cost.selection_steps:,} of "
@@ -311,7 +307,7 @@ def cost_rows(cost: Cost) -> list[CostRow]:
     rows = [
         CostRow(title, steps, time_text(cost.cpu_seconds[part]), wall.get(part, "-"))
         for part, (title, steps) in parts.items()
-        if part not in ("screen", "shared_policy") or cost.cpu_seconds[part]
+        if part != "screen" or cost.cpu_seconds[part]
     ]
     total = CostRow("Total", "", *(time_text(sum(each.values())) for each in (cost.cpu_seconds, cost.wall_seconds)))
     return [*rows, total]

@@ -98,15 +98,10 @@ BAD = {
         "family",
         "zone",
     ),
-    "shared policy that does not observe the body": ({"strategy": "critic"}, "critic", "design_in_observation"),
-    "unknown option of joint training": (
-        {
-            "strategy": "critic",
-            "environment": {"id": "SoftGym/FingerReach-v0", "design_in_observation": True},
-            "joint": {"keep": 1, "options": {"luck": 1}},
-        },
-        "luck",
-        "joint.options",
+    "shared policy that does not observe the body": (
+        {"strategy": "policy", "policy": "finger_reach_designs"},
+        "policy",
+        "design_in_observation",
     ),
     "unknown strategy": ({"strategy": "luck"}, "strategy", "'scratch'"),
     "no policy": ({"strategy": "warm_start"}, "policy", "warm_start"),
@@ -154,15 +149,6 @@ BAD = {
         {"strategy": "scratch", "training": {"steps": 2000}, "finalists": {"count": 1, "seeds": 1, "steps": 500}},
         "training.sac.learning_starts = 1000",
         "finalists.steps = 500",
-    ),
-    "a shared policy that learns nothing": (
-        {
-            "strategy": "critic",
-            "environment": {"id": "SoftGym/FingerReach-v0", "design_in_observation": True},
-            "joint": {"keep": 1, "steps": 800, "report_every": 400},
-        },
-        "joint.sac.learning_starts = 1000",
-        "joint.steps = 800",
     ),
     "more goals on the finer mesh than there are": (
         {"finalists": {"count": 1, "refinement": {"robot_options": {"mesh_size": 0.005}, "goals": 4}}},
@@ -225,14 +211,6 @@ BAD = {
         },
         "training.learner = recurrent",
         "allowed: episodes",
-    ),
-    "joint training on FEM": (
-        {
-            "strategy": "critic",
-            "environment": {"id": "SoftGym/FingerReach-v0", "backend": "fem", "design_in_observation": True},
-        },
-        "fem",
-        "surrogate",
     ),
 }
 

@@ -17,7 +17,6 @@ from softgym_envs.agents.config import TrainConfig
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.folder import SHARED_POLICY, StudyFolder
 from softgym_envs.codesign.phases.finalists import _trained_policy
-from softgym_envs.codesign.phases.shared_policy import joint_config
 from softgym_envs.codesign.phases.trial import body_training
 from softgym_envs.codesign.records import Finalist, FinalistTest
 from softgym_envs.codesign.report.page import write_report
@@ -85,25 +84,6 @@ def test_each_body_gets_a_policy_of_its_own_from_the_model(run):
     text = write_report(folder.path).read_text()
     assert "the policy that all trainings start from and the controllers of the trials" in text
     assert f"{tau:.2f} (Kendall" in text
-
-
-@pytest.mark.parametrize("strategy", ["critic", "distribution"])
-def test_joint_training_gives_the_shared_policy_and_the_first_bodies(strategy, run):
-    joint = {"steps": 320, "report_every": 160, "evaluation_episodes": 2, "keep": 2, "sac": QUICK}
-    folder, results = run(strategy=strategy, environment=SHOWN, trials=4, joint=joint)
-    trials = folder.results()
-    assert [trial.origin for trial in trials] == ["baseline", "joint 0", "joint 1", "sampler 3"]
-    bodies = load_study(folder).shared_policy.bodies
-    assert bodies
-    for trial, body in zip(trials[1:3], bodies, strict=False):
-        assert {name: trial.design[name] for name in body} == pytest.approx(body)
-        assert set(body) == set(folder.config.variables)
-    config = joint_config(folder)
-    assert config.environment.sample_design == list(folder.config.variables)
-    assert config.environment.task_options["goals"] == folder.goals["training"].tolist()
-    assert results.cost.joint_report_steps == 2 * 2 * 50
-    assert results.cost.joint_steps == 320 and results.cost.cpu_seconds["shared_policy"] > 0.0
-    assert "trained together" in write_report(folder.path).read_text()
 
 
 def test_several_objectives_and_constraints(run):

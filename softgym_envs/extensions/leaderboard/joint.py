@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from softgym_envs.agents.joint import PROPOSERS
 from softgym_envs.agents.training import train
-from softgym_envs.codesign.parts import JointConfig
+from softgym_envs.codesign.parts import TrainingConfig
 from softgym_envs.extensions.leaderboard.clock import working_seconds
 from softgym_envs.extensions.leaderboard.frozen import FrozenProblem
 from softgym_envs.extensions.leaderboard.problem import JudgedScore
+from softgym_envs.extensions.leaderboard.proposers import PROPOSERS
 from softgym_envs.storage import read_signed
 
 STEPS = 20_000
@@ -49,14 +49,14 @@ class _Folder:
 class JointOptimiser:
     """Trains one policy together with the bodies first, and then asks for the bodies that it found most promising.
 
-    These are the strategies ``"critic"`` (Luck et al. 2019) and ``"distribution"`` (Schaff et al. 2019) of studies; the
+    These are the methods ``"critic"`` (Luck et al. 2019) and ``"distribution"`` (Schaff et al. 2019); the
     search's judge scores the bodies. The steps of the training, its learning curve included, count in the ledger. After
     the at most 32 different bodies of the training, random ones follow.
 
     Args:
         problem: the problem, whose policies observe the body.
         seed: of the training.
-        proposer: key of `softgym_envs.agents.joint.PROPOSERS`.
+        proposer: key of `softgym_envs.extensions.leaderboard.proposers.PROPOSERS`.
         steps: environment steps of the training.
 
     Attributes:
@@ -101,7 +101,7 @@ class JointOptimiser:
                 f"training; at least {2 * (SHORTEST + whole)} are needed"
             )
         sac = {"learning_starts": min(1_000, steps // 4)}
-        joint = JointConfig.model_validate(
+        joint = TrainingConfig.model_validate(
             {
                 "steps": steps,
                 "report_every": -(-steps // REPORTS),

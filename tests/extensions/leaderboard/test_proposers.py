@@ -8,10 +8,15 @@ import numpy as np
 import pytest
 
 from softgym_envs.agents.config import TrainConfig
-from softgym_envs.agents.joint import PROPOSERS, CriticProposer, DistributionProposer, critic_values
 from softgym_envs.agents.learners.sac import make_model
 from softgym_envs.agents.training import train
 from softgym_envs.agents.vec_env import SB3VecEnv
+from softgym_envs.extensions.leaderboard.proposers import (
+    PROPOSERS,
+    CriticProposer,
+    DistributionProposer,
+    critic_values,
+)
 
 ENVIRONMENT = {
     "id": "SoftGym/FingerReach-v0",

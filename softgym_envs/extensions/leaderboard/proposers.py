@@ -22,11 +22,7 @@ if TYPE_CHECKING:
 
 
 class DesignProposer(ABC):
-    """Draws the bodies of training episodes, in unit coordinates [-1, 1] of the sampled variables.
-
-    `softgym_envs.agents.training.train` calls `attach` once, `begin` before and `save` after each part of the
-    training, and `finish` at the end.
-    """
+    """Draws the bodies of a training, see `softgym_envs.agents.training`, in unit coordinates [-1, 1] of its variables."""
 
     def attach(self, model: SAC, config: TrainConfig, folder: Path) -> None:
         """Start drawing the bodies of a training, continuing where an interrupted run stopped.
