@@ -213,7 +213,7 @@ def test_configurations_on_pages_are_valid(page, config):
 def test_parts_of_a_study_on_the_page_of_strategies_are_valid():
     """The first block is a whole study; each of the others replaces some of its keys."""
     study, *parts = (yaml.safe_load(text) for _, text, _ in code_blocks(DOCS / "strategies.md", "yaml"))
-    assert len(parts) == 4
+    assert len(parts) == 3
     for part in ({}, *parts):
         check_config(StudyConfig, study | part, "strategies")
 

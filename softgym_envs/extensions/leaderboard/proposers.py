@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class DesignProposer(ABC):
-    """Draws the bodies of a training, see `softgym_envs.agents.training`, in unit coordinates [-1, 1] of its variables."""
+    """Draws the bodies of a training (`softgym_envs.agents.training`), in unit coordinates [-1, 1] of its variables."""
 
     def attach(self, model: SAC, config: TrainConfig, folder: Path) -> None:
         """Start drawing the bodies of a training, continuing where an interrupted run stopped.
