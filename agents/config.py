@@ -154,7 +154,7 @@ class EnvironmentConfig(Config):
         row = self.row
         if row.robot is None:
             raise ValueError(f"environment '{self.id}' needs a robot: give robot and task in place of the id")
-        return make_robot(row.robot, **{**row.robot_options_on(self.backend), **self.robot_options})
+        return make_robot(row.robot, **{**row.robot_options, **self.robot_options})
 
     def make_task(self, robot: Robot | None = None) -> Task:
         """Return the task, for a robot that `make_robot` returned or a new one.

@@ -42,8 +42,8 @@ class EnvironmentOptions:
         backend_options: options of the backend; in batched environments ``weights`` and ``members``.
         plant: how the robot differs from its model: a number, or a range that each reset draws from, for attributes of
             `Plant`; ``{}`` for no difference, None for that of the environment's ID.
-        defaults: options of the environment's ID, which those above override one by one; its ``backend_options``
-            and ``backend_mesh`` (options of the robot) apply to its ``backend`` only.
+        defaults: options of the environment's ID, which those above override one by one; its ``backend_options`` apply
+            to its ``backend`` only, except whether and how bodies move.
     """
 
     design: Mapping[str, float] | None = None
@@ -164,16 +164,15 @@ def set_up(robot: RobotSource | None, task: TaskSource, backend: str | None, opt
     if robot is None:
         raise ValueError("robot is missing; allowed: a registered name, 'module:class', a class or an object")
     robot_options = {**defaults.get("robot_options", {}), **(options.robot_options or {})}
-    if backend in (None, defaults.get("backend")):
-        robot_options = {**defaults.get("backend_mesh", {}), **robot_options}
     made = make_robot(robot, **robot_options)
     backend_options = dict(options.backend_options or {})
     if backend is None:
         backend = default_backend(made, backend_options)
     usual = defaults.get("backend_options", {})
     if backend != defaults.get("backend"):  # of other backends, those that move bodies too do so
-        usual = shared_options(usual) if takes_option(backend, made, "dynamics") else {}
-    if not backend_options.get("dynamics", True):  # without motion, its options have no effect
+        usual = shared_options(usual)
+    # Without motion, its options have no effect; some backends always move bodies, in steps of their own.
+    if not (backend_options.get("dynamics", True) and takes_option(backend, made, "dynamics")):
         usual = {name: value for name, value in usual.items() if name not in shared_options(usual)}
     backend_options = {**usual, **backend_options}
     check_backend(backend, made, backend_options)

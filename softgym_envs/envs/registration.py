@@ -30,8 +30,8 @@ class EnvironmentRow:
         backend: name of the backend; None for the surrogate where weights ship for the robot, else FEM.
         robot_options: options of the robot.
         task_options: options of the task.
-        backend_options: options of that backend.
-        backend_mesh: options of the robot on that backend only, such as a coarse mesh for finite elements.
+        backend_options: options of that backend; those of `backends.time_steps.shared_options` also of all others that
+            take them, and of no backend that does not.
         plant: how the robot differs from its model, as the option of environments.
     """
 
@@ -42,7 +42,6 @@ class EnvironmentRow:
     robot_options: Mapping[str, Any] = field(default_factory=dict)
     task_options: Mapping[str, Any] = field(default_factory=dict)
     backend_options: Mapping[str, Any] = field(default_factory=dict)
-    backend_mesh: Mapping[str, Any] = field(default_factory=dict)
     plant: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -52,13 +51,8 @@ class EnvironmentRow:
         They are passed as one option because ``gymnasium.make`` replaces whole mappings: the user's ``robot_options``
         would otherwise replace all of these.
         """
-        options = ("robot_options", "task_options", "backend_options", "backend_mesh", "plant")
+        options = ("robot_options", "task_options", "backend_options", "plant")
         return {"defaults": {"backend": self.backend, **{name: dict(getattr(self, name)) for name in options}}}
-
-    def robot_options_on(self, backend: str | None) -> dict[str, Any]:
-        """Return the options of the robot on a backend; None for that of this row."""
-        mesh = self.backend_mesh if backend in (None, self.backend) else {}
-        return {**mesh, **self.robot_options}
 
     def spec(self, id: str) -> EnvSpec:
         """Return Gymnasium's specification of the environment, under an ID."""

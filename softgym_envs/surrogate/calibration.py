@@ -18,6 +18,7 @@ A calibration that meets such commands therefore limits the growth of trusted st
 from __future__ import annotations
 
 import copy
+import itertools
 import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields, replace
@@ -65,6 +66,9 @@ SEARCHES = 6
 ROUNDING = 1e-4
 """Relative change of a limit that may be rounding: networks in single precision give batches of other sizes slightly
 other values."""
+
+FORCES, FLOORS, POWERS = (0.0, 0.5, 1.0, 2.0), (0.1, 0.3, 1.0, 3.0), (0.5, 0.75, 1.0, 1.25)
+"""Weights of the disagreement about forces, floors [median spread inside] and powers that a calibration tries."""
 
 ROUNDS = 4
 POOL = 8
@@ -238,43 +242,47 @@ def conformal_quantile(scores: np.ndarray) -> float:
 def fit_calibration(model: SurrogateModel, states: StratifiedStates) -> Calibration:
     """Return the calibration of a model on judged states.
 
-    Floor and power are those with the least pinball loss of the logarithmic errors, all strata being equally important.
+    Weight of the forces, floor and power are those with the least pinball loss of the logarithmic errors, all strata
+    being equally important.
     """
+    model = _calibrated(model, Calibration())
     plain = predict(model, states)
     states, kept = states.rows(plain.found), plain.found
-    error, spread, growth = plain.error[kept], plain.spread[kept], plain.growth[kept]
+    error, place, growth = plain.error[kept], plain.spread[kept], plain.growth[kept]
     context = model.context(states.design)
     displacement, _ = reached(model, context, states.command)
+    force = model.force_spread(context, displacement)
     rows = {name: states.stratum == name for name in FACTOR_OF if (states.stratum == name).any()}
-    share, bare = model.domain.at_bounds(states.design), copy.copy(model)
+    at_bounds, bare = model.domain.at_bounds(states.design), copy.copy(model)
 
     def ratios(calibration: Calibration) -> np.ndarray:
         """Return the errors relative to the uncertainty."""
+        spread = np.hypot(place, calibration.forces * force)
         bare.domain = replace(model.domain, inflation=1.0, limit=np.inf, calibration=calibration)
-        factors = calibration.body_factors(share, len(model.domain.columns))
+        factors = calibration.body_factors(at_bounds, len(model.domain.columns))
         context.arrays["factor"], context.arrays["corner"] = (f[context.slot] for f in factors)
         return error / bare.trust(context, displacement, spread, states.command)[0]
 
     soft = float(np.quantile(growth[rows["near buckling"]], 0.1)) if "near buckling" in rows else np.inf
-    typical, best, least = float(np.median(spread[rows["inside"]])), Calibration(), np.inf
-    for floor in (0.1 * typical, 0.3 * typical, typical, 3.0 * typical):
-        for power in (0.5, 0.75, 1.0, 1.25):
-            found = Calibration(floor=floor, power=power, soft=soft)
-            # Each factor mainly acts on its own stratum.
-            for _ in range(20):
-                ratio = ratios(found)
-                quantile = {name: conformal_quantile(ratio[which]) for name, which in rows.items()}
-                scaled = {FACTOR_OF[s]: getattr(found, FACTOR_OF[s]) * quantile[s] for s in rows}
-                found = replace(found, **scaled)
-                if "slack corners" not in rows:
-                    found = replace(found, slack_corners=found.corners)
-                if all(abs(np.log(q)) < 1e-3 for q in quantile.values()):
-                    break
-            beyond = np.log(ratios(found))
-            pinball = np.maximum(COVERAGE * beyond, (COVERAGE - 1.0) * beyond)
-            loss = float(np.mean([pinball[which].mean() for which in rows.values()]))
-            if loss < least:
-                best, least = found, loss
+    best, least = Calibration(), np.inf
+    for forces, share, power in itertools.product(FORCES, FLOORS, POWERS):
+        typical = float(np.median(np.hypot(place, forces * force)[rows["inside"]]))
+        found = Calibration(forces=forces, floor=share * typical, power=power, soft=soft)
+        # Each factor mainly acts on its own stratum.
+        for _ in range(20):
+            ratio = ratios(found)
+            quantile = {name: conformal_quantile(ratio[which]) for name, which in rows.items()}
+            scaled = {FACTOR_OF[s]: getattr(found, FACTOR_OF[s]) * quantile[s] for s in rows}
+            found = replace(found, **scaled)
+            if "slack corners" not in rows:
+                found = replace(found, slack_corners=found.corners)
+            if all(abs(np.log(q)) < 1e-3 for q in quantile.values()):
+                break
+        beyond = np.log(ratios(found))
+        pinball = np.maximum(COVERAGE * beyond, (COVERAGE - 1.0) * beyond)
+        loss = float(np.mean([pinball[which].mean() for which in rows.values()]))
+        if loss < least:
+            best, least = found, loss
     return best
 
 
@@ -554,13 +562,19 @@ def _climb(
     ensemble = PotentialEnsemble.of_model(model, dtype=torch.float32)
     robot, (B, S, n) = model.robot, c.shape
     columns = [robot.design_space.names.index(name) for name in learned_variables(robot)]
+    zero = torch.tensor(-model.middle / model.half_range, dtype=torch.float32)
     _, trusted, displacement = _judge_points(model, x, c)
     for _ in range(steps):
         values = torch.tensor(_designs(model, x), requires_grad=True)
         u = torch.tensor((displacement - model.middle) / model.half_range, dtype=torch.float32, requires_grad=True)
         features = model.features.design(values).to(torch.float32).repeat_interleave(S, dim=0)
-        members = ensemble.effectors(ensemble.coefficients(features), u)[..., : model.effectors]
+        bodies = ensemble.coefficients(features)
+        members = ensemble.effectors(bodies, u)[..., : model.effectors]
         spread = ((members - members.mean(dim=0)) ** 2).mean(dim=0).sum(dim=1)
+        if weight := model.domain.calibration.forces:
+            efforts, lever = ensemble.gradients(bodies, u), ensemble.lever(bodies, zero.expand_as(u)).detach()
+            shifts = lever[:, : model.effectors] @ (efforts - efforts.mean(dim=0))[..., None]
+            spread = spread + weight**2 * (shifts[..., 0] ** 2).mean(dim=0).sum(dim=1)
         # Only trusted states count, so that no body leaves the region of trust altogether.
         torch.log(spread)[torch.as_tensor(trusted.ravel())].sum().backward()
         assert values.grad is not None and u.grad is not None

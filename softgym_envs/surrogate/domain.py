@@ -49,7 +49,12 @@ class Calibration:
     body lies in the design box: the logarithm is interpolated between those of bodies inside, on a face and at a vertex
     of the box. The default bounds the error by the spread itself.
 
+    Members may disagree about where the effector is, and about the forces of the actuators: those move the effector by
+    its compliance (`SurrogateModel.force_spread`). The spread is the root of the sum of both squares. An estimate from
+    few members is uncertain; one from twice as many quantities is less so.
+
     Attributes:
+        forces: weight of the disagreement about forces; 0 for weights that were calibrated without it.
         floor: noise floor of the ensemble standard deviation: members share some errors [m].
         power: how the error grows with the spread.
         inside: factor of bodies far from the bounds of all design variables.
@@ -60,6 +65,7 @@ class Calibration:
         soft: growth (see `Domain`) from which states count as near buckling.
     """
 
+    forces: float = 0.0
     floor: float = 0.0
     power: float = 1.0
     inside: float = 1.0
@@ -82,7 +88,8 @@ class Calibration:
         found = cls(**{name: float(value) for name, value in values.items()})
         for name in names:
             value = getattr(found, name)
-            if not (value > 0.0 or (name == "floor" and value == 0.0 and found.power == 1.0)):
+            may_vanish = name == "forces" or (name == "floor" and found.power == 1.0)
+            if not (value > 0.0 or (value == 0.0 and may_vanish)):
                 raise ValueError(f"the calibration of the card has {name} = {value}; it must be positive")
         return found
 

@@ -181,8 +181,8 @@ class SurrogateModel(ABC):
         """Return the predicted states at displacements (B, n_a).
 
         Returns:
-            Efforts [N, ...] (B, n_a), effector positions [m] (B, n_e), and the spread of the ensemble's effectors [m]
-            (B,), infinite for a model without an ensemble.
+            Efforts [N, ...] (B, n_a), effector positions [m] (B, n_e), and the spread of the ensemble [m] (B,), see
+            `softgym_envs.surrogate.domain.Calibration`; infinite for a model without an ensemble.
         """
         effort, effector, spread = self._state(context, displacement)
         return effort * context.stiffness[context.slot], effector, spread
@@ -194,6 +194,13 @@ class SurrogateModel(ABC):
     def effector(self, context: Context, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return only the effectors [m] (B, n_e) and their spread [m] (B,), at displacements (B, n_a)."""
         return self._state(context, displacement)[1:]
+
+    def force_spread(self, context: Context, displacement: np.ndarray) -> np.ndarray:
+        """Return how far an effector would move [m] (B,) by what the members' efforts differ at displacements (B, n_a).
+
+        It moves by the compliance of the body at displacement zero; zero for a model without an ensemble.
+        """
+        return np.zeros(len(displacement))
 
     def sensed(self, context: Context, displacement: np.ndarray) -> np.ndarray:
         """Return the sensor rows [m3] (B, n_s) at displacements (B, n_a)."""

@@ -20,7 +20,7 @@ CASES = {
         "SoftGym/TetrapodReach-v0",
         {"backend_options": {"dynamics": True, "scheme": "generalised_alpha"}, "design_in_observation": True},
     ),
-    "contact": ("SoftGym/FingerGrasp-v0", {"robot_options": COARSE}),
+    "contact": ("SoftGym/FingerGrasp-v0", {"backend": "fem", "robot_options": COARSE}),
     "chain": ("SoftGym/FingerGrasp-v0", {"backend": "surrogate"}),
 }
 

@@ -25,8 +25,6 @@ CASES = [
 ]
 # The hybrid backend consists of the other two, so one environment is enough.
 CASES.append(("SoftGym/FingerReach-v0", "hybrid"))
-# Chains have backends of their own; their hybrid one needs the accurate mesh, which takes too long here.
-CASES.append(("SoftGym/FingerGrasp-v0", "surrogate"))
 assert {backend for _, backend in CASES} == set(BACKENDS)
 # Coarse meshes for robots that have an option for them.
 LIGHT = {

@@ -32,11 +32,14 @@ from softgym_envs.surrogate.data import strata
 from softgym_envs.surrogate.data.strata import StratifiedStates, draw_commands, strata_of
 from softgym_envs.surrogate.domain import OUTSIDE, SOFT, SPREAD, Calibration, Domain, distrust_text
 from softgym_envs.surrogate.features import learned_variables
+from softgym_envs.surrogate.potential.model import Model
+from softgym_envs.surrogate.potential.training import stack_members, unstack_members
 from softgym_envs.surrogate.pretrained import pretrained_folder, pretrained_model, shipped_robots
 from softgym_envs.surrogate.weight_files import load_model, save_model
 from softgym_envs.testing import random_states
 
 CALIBRATION = {
+    "forces": 0.7,
     "floor": 1e-5,
     "power": 0.75,
     "inside": 2.0,
@@ -158,6 +161,48 @@ def test_uncertainty_follows_the_formula():
     outside[0, 0] = 0.03
     assert model.distrust(context, outside, spread, command)[1][0] == OUTSIDE
     assert model.distrust(context, displacement, np.full(6, np.inf), command)[1].tolist() == [0, 0, 0, 0, 0, OUTSIDE]
+
+
+@pytest.mark.parametrize("name", ["finger", "three_finger_gripper"])
+def test_what_members_disagree_about_moves_the_effector(name):
+    model = pretrained_model(make_robot(name))
+    designs, displacement = random_states(model.robot, 7)
+    states, scales = unstack_members(model.tensors)
+    alone = [Model(model.robot, stack_members([state], scales), {**model.card, "domain": {}}) for state in states]
+    context = model.context(designs)
+    each = np.stack([one.effort(one.context(designs), displacement) for one in alone])
+    places = np.stack([one.effector(one.context(designs), displacement)[0] for one in alone])
+    np.testing.assert_allclose(each.mean(axis=0), model.effort(context, displacement), atol=1e-4 * np.abs(each).max())
+    n = model.count
+    W = model.compliance(context, np.zeros_like(displacement))[:, n : n + model.effectors, :n]
+    moved = np.einsum("bei,mbi->mbe", W, each - each.mean(axis=0))
+    by_forces = np.sqrt((moved**2).sum(axis=2).mean(axis=0))
+    np.testing.assert_allclose(model.force_spread(context, displacement), by_forces, rtol=2e-2)
+    by_places = np.sqrt(((places - places.mean(axis=0)) ** 2).sum(axis=2).mean(axis=0))
+    for weight in (0.0, 0.5):
+        judged = with_domain(model, calibration={"forces": weight})
+        spread = judged.effector(judged.context(designs), displacement)[1]
+        np.testing.assert_allclose(spread, np.hypot(by_places, weight * by_forces), rtol=2e-2)
+    few = pretrained_model(model.robot, members=3)
+    few.domain = judged.domain
+    assert np.isinf(few.effector(few.context(designs), displacement)[1]).all()
+
+
+def test_a_calibration_finds_whether_forces_tell_the_error(trunk):
+    """Errors that are those of the forces are bounded by them, others by the places alone."""
+    for forces, wanted in ((True, {1.0, 2.0}), (False, {0.0, 0.5})):
+        parts = []
+        for kind in strata_of(trunk.robot, buckles=False):
+            states = predicted_states(trunk, kind, 40, 4, seed=3)
+            context = trunk.context(states.design)
+            size = (
+                trunk.force_spread(context, states.displacement)
+                if forces
+                else trunk.effector(context, states.displacement)[1]
+            )
+            states.effector[:, 0] += size * np.random.default_rng(0).uniform(0.9, 1.1, len(size))
+            parts.append(states)
+        assert fit_calibration(trunk, StratifiedStates.join(parts)).forces in wanted
 
 
 def test_doubt_in_words():

@@ -38,7 +38,7 @@ State = dict[str, Tensor]
 """Arrays of B states by name."""
 
 #: Arrays that differ between the members of the ensemble, (M, S, ...); the others are (S, ...).
-_PER_MEMBER = frozenset({"c", "a", "b", "d1", "d2", "x0", "slope", "held"})
+_PER_MEMBER = frozenset({"c", "a", "b", "quadratics", "linears", "d1", "d2", "x0", "slope", "held"})
 
 
 class TorchBatch:
@@ -104,6 +104,8 @@ class TorchBatch:
         if self._growth is not None:
             bodies["unmoved"] = self._ensemble.curvature(bodies, zero)
             bodies["known"] &= _definite(bodies["unmoved"])
+        if self._calibration.forces:
+            bodies["lever"] = self._ensemble.lever(bodies, zero)[:, : self._effectors]
         if self._loaded:
             u, gradient, _ = self.search(bodies, zero, zero, MAX_NEWTON_STEPS, stop=True)
         else:
@@ -123,8 +125,12 @@ class TorchBatch:
         mean = x.mean(dim=0)
         effector = (mean * self._effector_scale + self._effector_mean[: self._effectors])[:, :3]
         if self._calibrated:
-            square = ((x - mean) ** 2).mean(dim=0).reshape(len(u), -1, 3).sum(dim=2)
-            calibration, variance = self._calibration, square.amax(dim=1) * self._effector_scale**2
+            calibration, variance = self._calibration, _variance(x - mean)
+            if calibration.forces:
+                efforts = self._ensemble.gradients(bodies, u)
+                moved = (bodies["lever"] @ (efforts - efforts.mean(dim=0))[..., None])[..., 0]
+                variance = variance + calibration.forces**2 * _variance(moved)
+            variance = variance * self._effector_scale**2
             uncertainty = (
                 self._scale * bodies["factor"] * (variance + calibration.floor**2) ** (0.5 * calibration.power)
             )
@@ -295,6 +301,12 @@ def complementarity(
     value, slack = tableau[:, n].mT, torch.stack(free, dim=1)
     right = torch.stack([value[:, p] >= slightly for p in pull]).all(dim=0)
     return torch.where(slack, value, 0.0) * scale, torch.where(slack, 0.0, value) / scale, slack, right
+
+
+def _variance(differences: Tensor) -> Tensor:
+    """Mean square distance (B,) of points from their means, from those of members (M, B, e); the largest counts."""
+    square = (differences**2).mean(dim=0)
+    return square.reshape(len(square), -1, 3).sum(dim=2).amax(dim=1)
 
 
 def _definite(a: Tensor) -> Tensor:

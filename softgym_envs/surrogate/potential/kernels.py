@@ -61,11 +61,12 @@ def _multiply(h, weights, z, rows):
 
 
 @njit(**_FAST)
-def _gradients(u, slot, A1, A2, P, PT, c1, c2, a, b, quadratic, linear, kept, effort):
+def _gradients(u, slot, A1, A2, P, PT, c1, c2, a, b, quadratic, linear, kept, each, effort):
     """Fill ``effort`` (rows, n) with the gradient of the energy at scaled actuation u (rows, n), for one block.
 
     ``slot`` (rows,) is the body of each row. ``kept`` (members, 3, rows, w) is filled for `_curvatures`: the slope of
-    the first activation, and the weight of each layer's curvature in the Hessian.
+    the first activation, and the weight of each layer's curvature in the Hessian; ``each`` (members, rows, n) with what
+    the layers of each member add.
     """
     rows = len(u)
     members, n, w = A1.shape
@@ -114,6 +115,7 @@ def _gradients(u, slot, A1, A2, P, PT, c1, c2, a, b, quadratic, linear, kept, ef
                 value = np.float32(0.0)
                 for j in range(w):
                     value += lower[r, j] * A1[m, i, j] + z[r, j] * A2[m, i, j]
+                each[m, r, i] = value
                 effort[r, i] += share * value
 
 
@@ -156,22 +158,78 @@ def _curvatures(index, slot, A1, A2, PT, quadratic, kept, hessian):
 @njit(**_FAST)
 def efforts(u, slot, A1, A2, P, PT, c1, c2, a, b, quadratic, linear, effort):
     """Gradient of the energy (rows, n) at scaled actuation u (rows, n) of bodies ``slot`` (rows,)."""
-    kept = np.empty((len(A1), 3, min(ROWS_PER_BLOCK, len(u)), A1.shape[2]), np.float32)
+    most = min(ROWS_PER_BLOCK, len(u))
+    kept = np.empty((len(A1), 3, most, A1.shape[2]), np.float32)
+    each = np.empty((len(A1), most, u.shape[1]), np.float32)
     for start in range(0, len(u), ROWS_PER_BLOCK):
         rows = slice(start, start + ROWS_PER_BLOCK)
-        _gradients(u[rows], slot[rows], A1, A2, P, PT, c1, c2, a, b, quadratic, linear, kept, effort[rows])
+        _gradients(u[rows], slot[rows], A1, A2, P, PT, c1, c2, a, b, quadratic, linear, kept, each, effort[rows])
+
+
+@njit(**_FAST)
+def member_efforts(u, slot, A1, A2, P, PT, c1, c2, a, b, quadratics, linears, efforts):
+    """Gradients of the energies of the members (rows, members, n) at scaled actuation u (rows, n).
+
+    ``quadratics`` (bodies, members, n, n) and ``linears`` (bodies, members, n) are those of each member.
+    """
+    members, n, w = A1.shape
+    most = min(ROWS_PER_BLOCK, len(u))
+    kept, each = np.empty((members, 3, most, w), np.float32), np.empty((members, most, n), np.float32)
+    effort = np.empty((most, n), np.float32)
+    none, zero = np.zeros((len(c1), n, n), np.float32), np.zeros((len(c1), n), np.float32)
+    for start in range(0, len(u), ROWS_PER_BLOCK):
+        part = u[start : start + ROWS_PER_BLOCK]
+        _gradients(part, slot[start : start + len(part)], A1, A2, P, PT, c1, c2, a, b, none, zero, kept, each, effort)
+        for r in range(len(part)):
+            s = slot[start + r]
+            for m in range(members):
+                for i in range(n):
+                    value = each[m, r, i] + linears[s, m, i]
+                    for j in range(n):
+                        value += quadratics[s, m, i, j] * part[r, j]
+                    efforts[start + r, m, i] = value
+
+
+@njit(**_FAST)
+def moved_spreads(efforts, slot, lever, spread):
+    """How far differences of the efforts (rows, members, n) from their mean move a point: root mean square (rows,).
+
+    ``lever`` (bodies, e, n) moves the points, three coordinates each; the largest counts.
+    """
+    rows, members, n = efforts.shape
+    mean = np.empty(n, np.float32)
+    for r in range(rows):
+        s = slot[r]
+        for i in range(n):
+            mean[i] = 0.0
+            for m in range(members):
+                mean[i] += efforts[r, m, i] / np.float32(members)
+        largest = np.float32(0.0)
+        for first in range(0, lever.shape[1], 3):
+            square = np.float32(0.0)
+            for m in range(members):
+                for k in range(first, first + 3):
+                    move = np.float32(0.0)
+                    for i in range(n):
+                        move += lever[s, k, i] * (efforts[r, m, i] - mean[i])
+                    square += move * move
+            largest = max(largest, square)
+        spread[r] = np.sqrt(largest / np.float32(members))
 
 
 @njit(**_FAST)
 def hessians(u, slot, A1, A2, P, PT, c1, c2, a, b, quadratic, linear, hessian):
     """Hessian of the energy (rows, n, n) at scaled actuation u (rows, n) of bodies ``slot`` (rows,)."""
     size = min(ROWS_PER_BLOCK, len(u))
-    kept = np.empty((len(A1), 3, size, A1.shape[2]), np.float32)
+    kept, each = (
+        np.empty((len(A1), 3, size, A1.shape[2]), np.float32),
+        np.empty((len(A1), size, u.shape[1]), np.float32),
+    )
     effort, index = np.empty((size, u.shape[1]), np.float32), np.arange(size)
     for start in range(0, len(u), ROWS_PER_BLOCK):
         rows = slice(start, start + ROWS_PER_BLOCK)
         part, bodies = u[rows], slot[rows]
-        _gradients(part, bodies, A1, A2, P, PT, c1, c2, a, b, quadratic, linear, kept, effort)
+        _gradients(part, bodies, A1, A2, P, PT, c1, c2, a, b, quadratic, linear, kept, each, effort)
         _curvatures(index[: len(part)], bodies, A1, A2, PT, quadratic, kept, hessian[rows])
 
 
@@ -380,7 +438,7 @@ def search(
     """
     n = target.shape[1]
     size = min(ROWS_PER_BLOCK, len(target))
-    kept = np.empty((len(A1), 3, size, A1.shape[2]), np.float32)
+    kept, each = np.empty((len(A1), 3, size, A1.shape[2]), np.float32), np.empty((len(A1), size, n), np.float32)
     u, g, K = np.empty((size, n), np.float32), np.empty((size, n), np.float32), np.empty((size, n, n), np.float32)
     moving, asked, part = np.empty(size, np.int64), np.empty(size, np.int64), np.empty(size, np.int64)
     W, gap, taut, step = np.empty((size, n, n)), np.empty(n), np.empty(n), np.empty(n)
@@ -401,7 +459,7 @@ def search(
                 part[k] = slot[start + row]
                 for i in range(n):
                     u[k, i] = (d[row, i] - middle[i]) / half[i]
-            _gradients(u[:count], part, A1, A2, P, PT, c1, c2, a, b, quadratic, linear, kept, g)
+            _gradients(u[:count], part, A1, A2, P, PT, c1, c2, a, b, quadratic, linear, kept, each, g)
             left = 0
             for k in range(count):
                 row = moving[k]

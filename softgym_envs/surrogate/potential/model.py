@@ -133,12 +133,50 @@ class Model(SurrogateModel):
             factor[:, :, lower[0], lower[1]] = entries
             quadratic = factor + factor.swapaxes(2, 3)
         body["quadratic"], body["first"] = quadratic.mean(axis=1), np.ascontiguousarray(quadratic[:, 0])
+        body["quadratics"], body["linears"] = quadratic, np.ascontiguousarray(body["linear"])
         body["slope"] = body["slope"].reshape(rows, M, e, n)
         body["linear"] = np.ascontiguousarray(body["linear"].mean(axis=1))
         if self._rest is not None:
-            body["linear"] = np.zeros_like(body["linear"])
-            body["linear"] = -self._gradient(body, np.repeat(self._rest[None], rows, axis=0), np.arange(rows))
+            u, body["linears"] = np.repeat(self._rest[None], rows, axis=0), np.zeros_like(body["linears"])
+            body["linears"] = -self._member_efforts(body, u, np.arange(rows))
+            body["linear"] = body["linears"].mean(axis=1)
+        if self.domain.calibration.forces:
+            body["lever"] = self._lever(body)
         return body
+
+    def _lever(self, body: dict[str, np.ndarray]) -> np.ndarray:
+        """Return how efforts move the effectors of bodies at displacement zero, in scaled units, shape (S, n_e, n)."""
+        rows, n = len(body["c1"]), self.count
+        u, slot = np.repeat(self._scaled(np.zeros((1, n))), rows, axis=0), np.arange(rows)
+        hessian = np.empty((rows, n, n), dtype=np.float32)
+        coefficients = (body[k] for k in ("c1", "c2", "a", "b", "quadratic", "linear"))
+        kernels.hessians(u, slot, *self._energy, *coefficients, hessian)
+        jacobian, _ = self._jacobian(body, u, slot)
+        # K is symmetric: J K^-1 is the transpose of K^-1 J^T.
+        moved = np.linalg.solve(hessian.astype(float), jacobian[:, : self.effectors].swapaxes(1, 2).astype(float))
+        return np.ascontiguousarray(moved.swapaxes(1, 2), dtype=np.float32)
+
+    def _jacobian(self, body: dict[str, np.ndarray], u: np.ndarray, slot: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the Jacobian (B, n_e + n_s, n) and the held compliance of rows nothing drives, in scaled units."""
+        rows, e = len(u), self.passive
+        jacobian = np.empty((rows, e, self.count), dtype=np.float32)
+        held = np.empty((rows, e, e), dtype=np.float32)
+        coefficients = (body["d1"], body["d2"], body["slope"], body["held"])
+        kernels.jacobians(u, slot, *self._shape, self._held, *coefficients, jacobian, held)
+        return jacobian, held
+
+    def _member_efforts(self, body: dict[str, np.ndarray], u: np.ndarray, slot: np.ndarray) -> np.ndarray:
+        efforts = np.empty((len(u), self.members, self.count), dtype=np.float32)
+        coefficients = (body[k] for k in ("c1", "c2", "a", "b", "quadratics", "linears"))
+        kernels.member_efforts(u, slot, *self._energy, *coefficients, efforts)
+        return efforts
+
+    def force_spread(self, context: Context, displacement: np.ndarray) -> np.ndarray:
+        body, spread = context.arrays, np.empty(len(displacement), dtype=np.float32)
+        efforts = self._member_efforts(body, self._scaled(displacement), context.slot)
+        lever = body["lever"] if "lever" in body else self._lever(body)
+        kernels.moved_spreads(efforts, context.slot, lever, spread)
+        return spread * self.effector_scale
 
     def _gradient(self, body: dict[str, np.ndarray], u: np.ndarray, slot: np.ndarray) -> np.ndarray:
         effort = np.empty((len(u), self.count), dtype=np.float32)
@@ -172,9 +210,12 @@ class Model(SurrogateModel):
         spread = np.empty(len(u), dtype=np.float32)
         coefficients = (body["d1"], body["d2"], body["x0"], body["slope"])
         kernels.effectors(u, context.slot, *self._shape, *coefficients, self.effectors, effector, spread)
+        spread = spread * self.effector_scale
         if self.members < self.trained:
             spread = np.full(len(u), np.inf)
-        return effector * self.effector_scale + self.effector_mean, spread * self.effector_scale
+        elif weight := self.domain.calibration.forces:
+            spread = np.hypot(spread, weight * self.force_spread(context, displacement))
+        return effector * self.effector_scale + self.effector_mean, spread
 
     def effector_gradient(self, context: Context, displacement: np.ndarray, weights: np.ndarray) -> np.ndarray:
         u, body = self._scaled(displacement), context.arrays
@@ -223,12 +264,8 @@ class Model(SurrogateModel):
         return hessian.astype(float) * (self._effort_scale[:, None] / self.half_range)
 
     def _compliance(self, context: Context, displacement: np.ndarray) -> np.ndarray:
-        u, body = self._scaled(displacement), context.arrays
-        rows, n, e = len(u), self.count, self.passive
-        jacobian = np.empty((rows, e, n), dtype=np.float32)
-        held = np.empty((rows, e, e), dtype=np.float32)
-        coefficients = (body["d1"], body["d2"], body["slope"], body["held"])
-        kernels.jacobians(u, context.slot, *self._shape, self._held, *coefficients, jacobian, held)
+        rows, n = len(displacement), self.count
+        jacobian, held = self._jacobian(context.arrays, self._scaled(displacement), context.slot)
         K = self._stiffness(context, displacement)
         J = jacobian.astype(float) * (self.effector_scale / self.half_range)
         W = np.empty((rows, self.size, self.size))

@@ -101,8 +101,10 @@ class PotentialEnsemble:
             "a": softplus(part["a"] - SHIFT) * (0.5 / M),
             "b": softplus(part["b"] - SHIFT) / M,
             "quadratic": quadratic.mean(dim=0),
+            "quadratics": quadratic,
             "first": quadratic[0],
             "linear": part["linear"].mean(dim=0),
+            "linears": part["linear"],
             "d1": part["d1"].contiguous(),
             "d2": part["d2"].contiguous(),
             "x0": part["x0"].contiguous(),
@@ -110,8 +112,9 @@ class PotentialEnsemble:
             "held": part["held"].contiguous(),
         }
         if self._rest is not None:
-            body["linear"] = torch.zeros_like(body["linear"])
-            body["linear"] = -self.gradient(body, self._rest.expand(x.shape[0], n))
+            body["linears"] = torch.zeros_like(body["linears"])
+            body["linears"] = -self.gradients(body, self._rest.expand(x.shape[0], n))
+            body["linear"] = body["linears"].mean(dim=0)
         return body
 
     def _triangular(self, entries: Tensor, size: int, *, positive: bool) -> Tensor:
@@ -124,7 +127,10 @@ class PotentialEnsemble:
         return filled.reshape(self.members, -1, size, size)
 
     def _forward(self, body: Coefficients, u: Tensor, m: int) -> tuple[Tensor, ...]:
-        """Sum over the first ``m`` members of the gradients of their layers (B, n), and what `_hessian` needs."""
+        """Gradients of the layers of the first ``m`` members (m, B, n), and what `_hessian` needs.
+
+        Each holds its share of the mean: their sum is the gradient of the ensemble's layers.
+        """
         weights, U = self._weights, u.expand(m, -1, -1)
         z1, z2 = torch.baddbmm(body["c"][:m], U, weights["A"][:m]).split(self.width, dim=2)
         square = 1.0 + z1 * z1
@@ -134,8 +140,8 @@ class PotentialEnsemble:
         r2 = torch.rsqrt(1.0 + z2 * z2)
         upper = body["a"][:m] * (1.0 + z2 * r2)
         lower = torch.baddbmm(body["b"][:m], upper, weights["P"][:m])
-        gradient = torch.baddbmm(torch.bmm(upper, weights["E2"][:m]), slope * lower, weights["E1"][:m]).sum(dim=0)
-        return gradient, slope, lower, r1, r2
+        gradients = torch.baddbmm(torch.bmm(upper, weights["E2"][:m]), slope * lower, weights["E1"][:m])
+        return gradients, slope, lower, r1, r2
 
     def _hessian(self, body: Coefficients, slope: Tensor, lower: Tensor, r1: Tensor, r2: Tensor) -> Tensor:
         """Sum over the first members of the Hessians of their layers (B, n, n), from results of `_forward`."""
@@ -146,8 +152,19 @@ class PotentialEnsemble:
         hessian = torch.matmul(through * bent[:, :, None], through.transpose(-1, -2)).sum(dim=0)
         return hessian + torch.bmm(lower * r1**3, weights["outer"][:m]).sum(dim=0).reshape(-1, n, n)
 
-    def _with_body(self, body: Coefficients, u: Tensor, gradient: Tensor) -> Tensor:
-        return gradient + body["linear"] + (body["quadratic"] * u[:, None, :]).sum(dim=2)
+    def _with_body(self, body: Coefficients, u: Tensor, gradients: Tensor) -> Tensor:
+        return gradients.sum(dim=0) + body["linear"] + (body["quadratic"] * u[:, None, :]).sum(dim=2)
+
+    def gradients(self, body: Coefficients, u: Tensor) -> Tensor:
+        """Gradients of the energies of the members (M, B, n) at displacements u (B, n)."""
+        own = self.members * self._forward(body, u, self.members)[0]
+        return own + body["linears"] + (body["quadratics"] * u[:, None, :]).sum(dim=3)
+
+    def lever(self, body: Coefficients, u: Tensor) -> Tensor:
+        """How efforts move the rows that nothing drives (B, e, n), at displacements u (B, n): J K^-1."""
+        _, hessian = self.derivatives(body, u)
+        jacobian = self.shape(body, u)[1].mean(dim=0)
+        return torch.linalg.solve(hessian, jacobian.transpose(-1, -2)).transpose(-1, -2)
 
     def gradient(self, body: Coefficients, u: Tensor) -> Tensor:
         """Gradient of the energy (B, n) at displacements u (B, n)."""

@@ -4,10 +4,12 @@ import gymnasium
 import numpy as np
 import pytest
 
+import softgym_envs
 from softgym_envs import make_robot
 from softgym_envs.agents.baselines import make_baseline
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.envs import SoftRobotEnv
+from softgym_envs.envs.options import EnvironmentOptions, set_up
 from softgym_envs.envs.tasks.registry import make_task
 from softgym_envs.envs.vector_env import SoftRobotVectorEnv
 from softgym_envs.errors import InfeasibleDesign, WeightsError
@@ -19,7 +21,7 @@ COARSE = {"element": "linear", "mesh_size": 0.015}
 
 
 def grasp(**options):
-    return gymnasium.make("SoftGym/FingerGrasp-v0", robot_options=COARSE, **options)
+    return gymnasium.make("SoftGym/FingerGrasp-v0", backend="fem", robot_options=COARSE, **options)
 
 
 def lift(backend, **options):
@@ -64,6 +66,7 @@ def test_force_control_reaches_the_wanted_force():
     """On another object than the baseline, with the contact of the finite-element model."""
     env = gymnasium.make(
         "SoftGym/FingerGrasp-v0",
+        backend="fem",
         robot_options=COARSE | {"object": "horizontal_hexagon"},
         design={"friction": 0.4, "object_gap": 0.020},
     )
@@ -81,13 +84,15 @@ def test_force_control_on_the_learned_chain():
         assert infos[-1]["trusted"] and infos[-1]["converged"]
 
 
-def test_each_backend_has_its_own_mesh():
-    """The chain stands for the accurate mesh; finite elements take a coarse one unless told otherwise."""
-    sizes = {
-        backend: gymnasium.make("SoftGym/FingerGrasp-v0", backend=backend).unwrapped.robot.mesh_size
-        for backend in ("fem", "surrogate", "hybrid")
-    }
-    assert sizes == {"fem": 0.020, "surrogate": 0.008, "hybrid": 0.008}
+def test_all_backends_have_the_same_mesh():
+    for identifier in ("SoftGym/FingerGrasp-v0", "SoftGym/GripperLift-v0"):
+        row = softgym_envs.ENVIRONMENTS[identifier]
+        robot = make_robot(row.robot, **row.robot_options)
+        assert row.backend == "surrogate" and robot.mesh_size == 0.008
+        assert gymnasium.make(identifier).unwrapped.robot.mesh_size == 0.008
+    # Whatever the default is, boxes fall: on finite elements too.
+    options = EnvironmentOptions.check({"robot_options": COARSE, "defaults": row.defaults["defaults"]})
+    assert set_up(row.robot, row.task, "fem", options).backend_options == {"dynamics": True, "time_step": 0.05}
     with pytest.raises(WeightsError, match="mesh_size = 0.008, needed 0.02"):
         gymnasium.make("SoftGym/FingerGrasp-v0", backend="surrogate", robot_options={"mesh_size": 0.020})
 
