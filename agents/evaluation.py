@@ -20,6 +20,8 @@ from softgym_envs.executors import parallel_map
 if TYPE_CHECKING:
     import gymnasium
 
+    from softgym_envs.backends.backend import State
+
 SETTLED = 20
 """Last steps of an episode over which distances are averaged where a body swings about its goal."""
 
@@ -49,6 +51,10 @@ class Evaluation:
             is not known.
         largest_efforts: largest effort of any actuator in any step of each episode [N, ...], shape (n,); NaN if it is
             not known.
+        largest_strains: largest strain of a drive in any step of each episode, shape (n,): the displacement over the
+            length of its cable or the volume of its chamber at rest; NaN without finite elements, and for servos.
+        self_forces: largest sum of the forces with which surfaces of the body press on each other in any step of each
+            episode [N], shape (n,); NaN where they are not computed.
         tallies: what the task counts (`Task.tallies`), at the end of each episode [SI], each of shape (n,).
         seconds: wall-clock time [s].
         cpu_seconds: CPU time of this process [s].
@@ -64,6 +70,8 @@ class Evaluation:
     untrusted: np.ndarray | None = None
     largest_efforts: np.ndarray | None = None
     settled_distances: np.ndarray | None = None
+    largest_strains: np.ndarray | None = None
+    self_forces: np.ndarray | None = None
     tallies: dict[str, np.ndarray] = field(default_factory=dict)
     seconds: float = 0.0
     cpu_seconds: float = 0.0
@@ -161,6 +169,24 @@ class Evaluation:
         return cls(**columns, tallies=tallies, steps=cost[0], seconds=cost[1], cpu_seconds=cost[2])
 
 
+def drive_strains(displacement: np.ndarray, sizes: np.ndarray | None) -> np.ndarray:
+    """Return the largest strain of a drive, shape (...): NaN without sizes.
+
+    Args:
+        displacement: of the actuators [m, ...], shape (..., n_a).
+        sizes: `Constraint.rest_size` of the actuators, shape (..., n_a), or None.
+    """
+    if sizes is None:
+        return np.full(displacement.shape[:-1], np.nan)
+    strains = np.abs(displacement) / sizes
+    return np.where(np.isnan(strains).all(axis=-1), np.nan, np.where(np.isnan(strains), 0.0, strains).max(axis=-1))
+
+
+def self_force(state: State) -> float:
+    """Return the force with which surfaces of a body press on each other [N]; NaN where contact is not computed."""
+    return np.nan if state.contacts is None else state.contacts.self_force
+
+
 def none_for_nan(values: Any) -> Any:
     """Return a number, or numbers as lists, with None for NaN, which JSON lacks."""
     if isinstance(values, np.ndarray):
@@ -175,7 +201,7 @@ def _column(values: Any) -> np.ndarray:
     return found.astype(float) if found.dtype == object else found
 
 
-_LATER = ("untrusted", "largest_efforts", "settled_distances")
+_LATER = ("untrusted", "largest_efforts", "settled_distances", "largest_strains", "self_forces")
 """Columns that older files do not have."""
 _PER_GOAL = ("distances", "tracking_distances", "returns", "successes", "efforts", "ends", *_LATER)
 _SUMMARY = (
@@ -377,12 +403,15 @@ def _run_episode(env: gymnasium.Env, act: Agent, seed: int, options: dict[str, A
     total, effort, largest, untrusted, ended = 0.0, 0.0, 0.0, 0, False
     distances: list[float] = []
     inner: Any = env.unwrapped
+    sizes, strain, pressing = inner.backend.rest_sizes, np.float64(0.0), np.float64(0.0)
     while not ended:
         observation, reward, terminated, truncated, info = env.step(act(observation, inner))
         total += float(reward)
         efforts = env.unwrapped.robot.effort_sizes(info["effort"])  # type: ignore[attr-defined]
         effort, largest = effort + float(efforts.mean()), max(largest, float(efforts.max()))
         distances.append(float(info["distance"]))
+        strain = np.maximum(strain, drive_strains(info["displacement"], sizes))
+        pressing = np.maximum(pressing, self_force(inner.state))
         untrusted += not info["trusted"]
         ended = terminated or truncated
     steps = len(distances)
@@ -396,6 +425,8 @@ def _run_episode(env: gymnasium.Env, act: Agent, seed: int, options: dict[str, A
         "ends": info["effector"],
         "untrusted": untrusted / steps,
         "largest_efforts": largest,
+        "largest_strains": strain,
+        "self_forces": pressing,
         "tallies": {name: info[name] for name in inner.task.tallies},
         "steps": steps,
     }
@@ -412,12 +443,13 @@ def _evaluate_together(
         act: Callable[[np.ndarray], np.ndarray] = lambda observation: control()  # noqa: E731
     else:
         act = Policy(agent).begin()
-    distances, totals, returns, efforts, largest, untrusted, lengths = np.zeros((7, count))
+    distances, totals, returns, efforts, largest, strains, untrusted, lengths = np.zeros((8, count))
     recent = np.full((SETTLED, count), np.nan)
     successes, running, ends = np.zeros(count, dtype=bool), np.ones(count, dtype=bool), np.zeros((count, 3))
     tallies = {name: np.zeros(count) for name in env.unwrapped.task.tallies}
     try:
         observation, _ = env.reset(seed=seed, options={"design": design, "goal": goals})
+        sizes = env.unwrapped.backend.rest_sizes
         while running.any():
             observation, reward, terminated, truncated, info = env.step(act(observation))
             last = info.get("final_info", info)
@@ -431,6 +463,8 @@ def _evaluate_together(
             effort = env.unwrapped.robot.effort_sizes(last["effort"])
             efforts += running * effort.mean(axis=1)
             largest = np.maximum(largest, running * effort.max(axis=1))
+            now = drive_strains(last["displacement"], sizes)
+            strains = np.where(running, np.maximum(strains, now), strains)
             untrusted += running & ~last["trusted"]
             lengths += running
             running &= ~(terminated | truncated)
@@ -446,6 +480,7 @@ def _evaluate_together(
         untrusted=untrusted / lengths,
         largest_efforts=largest,
         settled_distances=np.nanmean(recent, axis=0),
+        largest_strains=strains,
         tallies=tallies,
         steps=int(lengths.sum()),
     )

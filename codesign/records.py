@@ -307,6 +307,16 @@ class TestGroup:
         """Largest effort of any actuator in any episode of any seed [N, ...]; NaN if it is not known."""
         return float(self.table("largest_efforts").max())
 
+    @property
+    def largest_strain(self) -> float:
+        """Largest strain of any drive in any episode of any seed; NaN if it is not known."""
+        return float(self.table("largest_strains").max())
+
+    @property
+    def self_force(self) -> float:
+        """Largest force with which surfaces of the body press on each other in any episode [N]; NaN if not known."""
+        return float(self.table("self_forces").max())
+
     def to_json(self) -> dict[str, Any]:
         """Return the average and the values of each seed as plain data."""
         data: dict[str, Any] = {"trial": self.trial, "agent": self.agent, "backend": self.backend, "goals": self.goals}

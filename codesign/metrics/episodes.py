@@ -59,6 +59,24 @@ def largest_effort(outcome: Outcome) -> np.ndarray | None:
     return outcome.evaluation.largest_efforts
 
 
+@metric(shown=PERCENT, label="Largest strain of a drive", over_path=True)
+def largest_strain(outcome: Outcome) -> np.ndarray | None:
+    """Return the largest displacement of a drive in each episode over its length or volume at rest."""
+    return _known(outcome.evaluation.largest_strains, "largest_strain", "cables and chambers")
+
+
+@metric("N", label="Self-contact", over_path=True)
+def self_force(outcome: Outcome) -> np.ndarray | None:
+    """Return the largest force in each episode with which surfaces of the body press on each other."""
+    return _known(outcome.evaluation.self_forces, "self_force", "bodies with self-contact")
+
+
+def _known(values: np.ndarray | None, name: str, where: str) -> np.ndarray:
+    if values is None or np.isnan(values).any():
+        raise ValueError(f"metric '{name}' is computed on finite elements only, for {where}")
+    return values
+
+
 @metric(shown=PERCENT, label="Share of untrusted states", over_path=True)
 def untrusted_share(outcome: Outcome) -> np.ndarray | None:
     """Return the share of the steps of each episode in which the surrogate does not trust itself."""

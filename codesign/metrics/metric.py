@@ -207,7 +207,7 @@ TYPICAL = Display("% of the typical effort", 100.0, 0)
 _NAMES = (
     *("success_rate", "mean_distance", "mean_return", "mean_tracking_distance", "mean_effort"),
     "mean_settled_distance",
-    *("largest_effort", "untrusted_share", "material_volume"),
+    *("largest_effort", "largest_strain", "self_force", "untrusted_share", "material_volume"),
     *("forward_speed", "relative_drift", "relative_slip", "cost_of_transport"),
 )
 METRICS: Mapping[str, Metric] = _Metrics(

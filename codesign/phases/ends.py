@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.agents.config import EnvironmentConfig
-from softgym_envs.agents.evaluation import Evaluation, make_agent
+from softgym_envs.agents.evaluation import Evaluation, drive_strains, make_agent, self_force
 from softgym_envs.agents.policy import Policy
 from softgym_envs.control.settling import nearest_next, settle
 from softgym_envs.errors import ConfigError, ConvergenceError
@@ -92,6 +92,8 @@ def run_ends(
         efforts=columns["effort"],
         ends=columns["effector"],
         largest_efforts=columns["largest"],
+        largest_strains=columns["strain"],
+        self_forces=columns["self_force"],
         steps=sum(each.equilibria for each in ended.values()),
         seconds=time.perf_counter() - began,
         cpu_seconds=time.process_time() - cpu,
@@ -152,6 +154,8 @@ class _End:
     success: bool
     efforts: np.ndarray
     effector: np.ndarray
+    strain: float
+    self_force: float
     equilibria: int
     motion: float | None = None
 
@@ -166,7 +170,7 @@ class _End:
         return float(self.efforts.max())
 
 
-_COLUMNS = ("distance", "success", "effort", "largest", "effector")
+_COLUMNS = ("distance", "success", "effort", "largest", "effector", "strain", "self_force")
 
 
 def _settle(asked: _PendingGoals) -> tuple[dict[int, _End], int]:
@@ -174,6 +178,7 @@ def _settle(asked: _PendingGoals) -> tuple[dict[int, _End], int]:
     robot = asked.environment.make_robot()
     success = asked.environment.make_task(robot).success_distance
     statics, ends = Statics(robot.build(asked.design)), {}
+    rest = np.array([drive.rest_size() for drive in statics.model.constraints["a"]])
     for k in asked.order:
         point, command = asked.points[k], asked.commands[k]
         try:
@@ -185,7 +190,9 @@ def _settle(asked: _PendingGoals) -> tuple[dict[int, _End], int]:
         except ConvergenceError as error:
             raise asked.lost(k, error) from None
         sizes = robot.effort_sizes(found.effort)
-        ends[k] = _End(found.distance, found.distance < success, sizes, found.effector, found.equilibria)
+        strain = float(drive_strains(found.displacement, rest))
+        reached, where = found.distance < success, found.effector
+        ends[k] = _End(found.distance, reached, sizes, where, strain, found.self_force, found.equilibria)
     return ends, statics.model.equations
 
 
@@ -217,7 +224,9 @@ def _follow(asked: _PendingGoals, agent: str | Path, last_steps: int) -> tuple[d
             motion = float(np.linalg.norm(info["effector"] - before))
             distance, success = float(info["distance"]), bool(info["is_success"])
             sizes = inner.robot.effort_sizes(info["effort"])
-            ends[k] = _End(distance, success, sizes, info["effector"], 1 + last_steps, motion)
+            strain = float(drive_strains(info["displacement"], inner.backend.rest_sizes))
+            pressing = self_force(inner.state)
+            ends[k] = _End(distance, success, sizes, info["effector"], strain, pressing, 1 + last_steps, motion)
         return ends, inner.backend.model.equations
     finally:
         env.close()

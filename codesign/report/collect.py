@@ -173,6 +173,8 @@ def _statistics(group: TestGroup, objective: Metric) -> BodyStatistics:
         objective=group.value(objective.name),
         objective_interval=None if own is None else mean_interval(own),
         largest_effort=none_for_nan(group.largest_effort),
+        largest_strain=none_for_nan(group.largest_strain),
+        self_force=none_for_nan(group.self_force),
     )
 
 

@@ -23,7 +23,10 @@ TRUSTED = 0.9
 """Share of trusted states below which a search on the surrogate is doubtful."""
 
 COSTLIER = 1.1
-"""Ratio of the winner's effort to the baseline's from which it is part of the result."""
+"""Ratio of the winner's effort, strain or self-contact to the baseline's from which it is part of the result."""
+
+PRESSED = 0.1
+"""Self-contact below which it does not matter [N]."""
 
 
 @dataclass(frozen=True)
@@ -153,7 +156,7 @@ def _ranking(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:
 
 
 def _effort(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:
-    """Return whether the winner needs larger efforts than the baseline."""
+    """Return whether the winner needs larger efforts or strains than the baseline, or presses itself shut."""
     if results.winner is None or results.winner.role == "baseline":
         return None
     agent = results.winner.agents[0]
@@ -166,12 +169,23 @@ def _effort(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:
         if before and after and after > COSTLIER * before:
             effort = snapshot.config.effort
             parts.append(f"{kind} effort is {effort.text(after)} instead of {effort.text(before)}")
+    limits = ["largest_effort"] if parts else []
+    for kind, words, unit, least in (
+        ("largest_strain", "largest strain of a drive", "%", 0.0),
+        ("self_force", "self-contact", "N", PRESSED),
+    ):
+        before, after = (getattr(body, kind) for body in (row.baseline, row.winner))
+        if before is None or after is None or after <= max(COSTLIER * before, least):
+            continue
+        shown = [f"{100 * value:.1f} %" if unit == "%" else present(value, unit) for value in (after, before)]
+        parts.append(f"{words} is {shown[0]} instead of {shown[1]}")
+        limits.append(kind)
     if not parts:
         return None
     return Finding(
-        "The winner pulls harder",
+        "The winner pulls harder" if "largest_effort" in limits else "The winner strains more",
         f"On FEM its {' and its '.join(parts)}: part of its gain may be the stronger drive. A study with constraints "
-        "on largest_effort compares bodies at equal drives.",
+        f"on {' and '.join(limits)} compares bodies at equal cost.",
     )
 
 

@@ -60,7 +60,9 @@ class BodyStatistics(Record):
     mean_effort: float
     objective: float
     objective_interval: Interval
-    largest_effort: float | None = None  # unknown in tests of earlier versions
+    largest_effort: float | None = None  # unknown in tests of earlier versions, as are the next two
+    largest_strain: float | None = None  # of a drive, over its length or volume at rest
+    self_force: float | None = None  # with which surfaces of the body press on each other
 
 
 @dataclass(frozen=True, eq=False)

@@ -241,7 +241,11 @@ def _origin_of_goals(snapshot: StudySnapshot) -> str:
 
 def effort_note(snapshot: StudySnapshot) -> str:
     """Return over what the efforts of the test are means, and of what they are the largest."""
-    note = "Means are over actuators, steps and goals; the largest is that of any actuator in any step."
+    note = (
+        "Means are over actuators, steps and goals; the largest is that of any actuator in any step. The strain of a "
+        "drive is its displacement over the length of its cable or the volume of its chamber at rest; self-contact is "
+        "the force with which surfaces of the body press on each other."
+    )
     if len({actuator.unit for actuator in snapshot.config.robot.actuators}) > 1:
         note += " Actuators of several units are compared by their typical efforts (effort_scale)."
     if snapshot.config.finalists.test == "ends":

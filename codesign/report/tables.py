@@ -62,12 +62,14 @@ class ComparisonRow:
 
 @dataclass(frozen=True)
 class EffortRow:
-    """Mean and largest effort of baseline and winner with one controller on one backend."""
+    """What baseline and winner cost with one controller on one backend: efforts, strain of drives, self-contact."""
 
     backend: str
     agent: str
     mean: list[str]
     largest: list[str]
+    strain: list[str]
+    pressing: list[str]
 
 
 @dataclass(frozen=True)
@@ -203,6 +205,8 @@ def effort_rows(comparison: Sequence[Comparison], effort: Metric) -> list[Effort
             agent=AGENTS[row.agent],
             mean=[effort.text(body.mean_effort) for body in (row.baseline, row.winner)],
             largest=[effort.text(body.largest_effort) for body in (row.baseline, row.winner)],
+            strain=["-" if s is None else percent(s) for s in (row.baseline.largest_strain, row.winner.largest_strain)],
+            pressing=["-" if f is None else present(f, "N") for f in (row.baseline.self_force, row.winner.self_force)],
         )
         for row in comparison
     ]

@@ -287,6 +287,11 @@ class Backend(ABC):
     design: Design
     state: State
 
+    @property
+    def rest_sizes(self) -> np.ndarray | None:
+        """Return `Constraint.rest_size` of each actuator, shape (n_a,); None where no mechanical model is at hand."""
+        return None
+
     @classmethod
     def batch_class(cls, robot: Robot, options: Mapping[str, object]) -> type | str | None:
         """Return what steps many bodies of a robot in one call, as this backend with these options; None for nothing.

@@ -99,6 +99,11 @@ class BatchBackend(ABC):
     state: BatchState
     command: np.ndarray
 
+    @property
+    def rest_sizes(self) -> np.ndarray | None:
+        """Return `Constraint.rest_size` of each actuator, shape (B, n_a); None where no mechanical model is at hand."""
+        return None
+
     @abstractmethod
     def begin(self, index: np.ndarray, designs: np.ndarray) -> Mapping[int, InfeasibleDesign]:
         """Give rows other bodies, at rest.

@@ -253,6 +253,10 @@ class FEMBackend(Backend):
         self.restore(self._rest)
 
     @property
+    def rest_sizes(self) -> np.ndarray:
+        return np.array([drive.rest_size() for drive in self.model.constraints["a"] for _ in range(drive.size)])
+
+    @property
     def cable_compliance(self) -> np.ndarray:
         """How far each cable stretches per tension [m/N], shape (n_a,); another one applies from the next step."""
         return self._compliance

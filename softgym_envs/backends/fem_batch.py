@@ -88,6 +88,10 @@ class FEMBatch(BatchBackend):
         self._frames = solvers[0].body.elements.frames
         self._beams = BeamBatch([s.body for s in solvers], [owner.model.loads for owner in self._owners.values()])
 
+    @property
+    def rest_sizes(self) -> np.ndarray:
+        return np.stack([self._owners[design].rest_sizes for design in self._designs])
+
     def begin(self, index: np.ndarray, designs: np.ndarray) -> Mapping[int, InfeasibleDesign]:
         impossible: dict[int, InfeasibleDesign] = {}
         found: dict[int, Design] = {}

@@ -26,6 +26,8 @@ class Settled:
         command: shape (n_a,).
         effector: first effector [m], shape (3,).
         effort: shape (n_a,).
+        displacement: of the actuators, shape (n_a,).
+        self_force: with which surfaces of the body press on each other [N]; NaN without contact.
         distance: from the goal [m], along the robot's goal axes.
         change: largest change of the last command, relative to its range; small if the QP has settled.
         equilibria: number of equilibria that were solved.
@@ -34,6 +36,8 @@ class Settled:
     command: np.ndarray
     effector: np.ndarray
     effort: np.ndarray
+    displacement: np.ndarray
+    self_force: float
     distance: float
     change: float
     equilibria: int
@@ -83,7 +87,9 @@ def settle(
             effector = state.condensed.delta.e[:3]
             distance = float(np.linalg.norm((effector - goal) * robot.goal_axes))
             if best is None or distance < best[0].distance:
-                best = Settled(command, effector, state.effort[: len(span)], distance, np.inf, count), state
+                effort, displacement = state.effort[: len(span)], state.delta[: len(span)]
+                pressing = np.nan if state.contacts is None else state.contacts.self_force
+                best = Settled(command, effector, effort, displacement, pressing, distance, np.inf, count), state
             else:
                 longest *= 0.5
         found, state = best

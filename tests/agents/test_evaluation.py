@@ -53,7 +53,7 @@ def test_files_hold_everything(evaluation):
 
 def test_files_from_before_trust_and_largest_efforts_were_recorded_can_be_read():
     data = some(3, 0).to_json()
-    for name in ("untrusted", "largest_efforts", "settled_distances"):
+    for name in ("untrusted", "largest_efforts", "settled_distances", "largest_strains", "self_forces"):
         assert data.pop(name) == [None, None, None]
         assert np.isnan(getattr(Evaluation.from_json(data), name)).all()
     distances = data["mean_distances"] = data.pop("tracking_distances")  # its earlier name
@@ -66,17 +66,22 @@ def test_largest_efforts_are_those_of_any_actuator_in_any_step(backend):
     goals = sample_goals(environment, 2, seed=0)
     found = evaluate("qp", environment, goals)
     env = environment.make()
-    act, largest, means = make_agent("qp"), [], []
+    act, largest, means, strains = make_agent("qp"), [], [], []
+    lengths = [cable.rest_length for cable in env.unwrapped.robot.build().constraints["a"]]
     for goal in goals:
         observation, _ = env.reset(seed=0, options={"goal": goal})
-        efforts = []
+        efforts, pulled = [], []
         for _ in range(4):
             observation, _, _, _, info = env.step(act(observation, env.unwrapped))
             efforts.append(np.abs(info["effort"]))
+            pulled.append(np.abs(info["displacement"]))
+        strains.append(np.max(np.max(pulled, axis=0) / lengths))
         largest.append(np.max(efforts))
         means.append(np.mean(efforts))
     np.testing.assert_allclose(found.largest_efforts, largest, rtol=1e-3)
     np.testing.assert_allclose(found.efforts, means, rtol=1e-3)
+    np.testing.assert_allclose(found.largest_strains, strains if backend == "fem" else np.full(2, np.nan), rtol=1e-3)
+    assert np.isnan(found.self_forces).all()  # no surface touches another one
 
 
 @pytest.mark.parametrize("backend", ["surrogate", "fem"])  # together and one by one

@@ -185,7 +185,7 @@ def test_efforts_stand_in_the_report(tested):
     assert (row.backend, row.agent, row.mean, row.largest) == ("FEM", "Policy", ["1.00 N"] * 2, ["9.00 N"] * 2)
     body = replace(results.comparison[0].winner, largest_effort=None)  # of an earlier version
     (row,) = effort_rows([replace(results.comparison[0], winner=body)], snapshot.config.effort)
-    assert row.largest == ["9.00 N", "-"]
+    assert row.largest == ["9.00 N", "-"] and row.strain == row.pressing == ["-", "-"]
 
 
 def test_finalists_differ(study):
@@ -268,3 +268,35 @@ def test_the_policy_limits_only_where_the_qp_closes_a_substantial_part(tested):
     """8.23 against 7.94 mm is no reason to train longer."""
     found = titles(tested(np.full(6, 8.23e-3), np.full(6, 7.94e-3) + 1e-3 * WIGGLE))
     assert "The body limits, not the policy" in found and "The policy limits, not the body" not in found
+
+
+@pytest.mark.parametrize(
+    ("baseline", "winner", "title", "words"),
+    [
+        ({}, {}, None, ""),
+        ({"largest_strain": 0.2}, {"largest_strain": 0.21}, None, ""),
+        (
+            {"largest_strain": 0.2},
+            {"largest_strain": 0.3},
+            "strains more",
+            "strain of a drive is 30.0 % instead of 20.0 %",
+        ),
+        ({"self_force": 0.0}, {"self_force": 0.05}, None, ""),
+        ({"self_force": 0.0}, {"self_force": 32.0}, "strains more", "its self-contact is 32.00 N instead of 0.00 N"),
+        (
+            {"self_force": 1.0},
+            {"self_force": 2.0, "largest_effort": 12.0},
+            "pulls harder",
+            "largest_effort and self_force",
+        ),
+    ],
+)
+def test_a_winner_that_costs_more_is_named(tested, baseline, winner, title, words):
+    snapshot = tested(FAR, NEAR)
+    results = collect(snapshot)
+    row = results.comparison[0]
+    row = replace(row, baseline=replace(row.baseline, **baseline), winner=replace(row.winner, **winner))
+    found = findings(snapshot, replace(results, comparison=[row]))
+    found = [finding for finding in found if finding.title.startswith(("The winner pulls", "The winner strains"))]
+    assert [finding.title for finding in found] == ([f"The winner {title}"] if title else [])
+    assert all(words in finding.text for finding in found)

@@ -134,6 +134,9 @@ class Cable(Constraint):
         ids, weights = self.embedding.node_ids, self.embedding.weights
         return _cable_length(x, ids, weights, self.pull_point, self._slot, self._points, self._gradient)
 
+    def rest_size(self) -> float:
+        return self.rest_length
+
     def value(self, x: np.ndarray) -> np.ndarray:
         return np.array([self.rest_length - self._length(x)])
 

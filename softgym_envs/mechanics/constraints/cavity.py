@@ -121,6 +121,9 @@ class Cavity(Constraint):
             return self.triangles
         return self.triangles[:, [[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]]].reshape(-1, 3)
 
+    def rest_size(self) -> float:
+        return self.rest_volume
+
     def volume(self, x: np.ndarray) -> float:
         """Enclosed volume [m3] at node positions ``x`` (n, 3)."""
         return _weighted_volume(x, self._triples, self._weights)

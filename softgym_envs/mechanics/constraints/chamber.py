@@ -93,6 +93,9 @@ class Chamber(Constraint):
         self._blocks = np.empty((len(self._rows), k, k))
         self.rest_length = float(sum(np.linalg.norm(line.points, axis=1).sum() for line in tangents))
 
+    def rest_size(self) -> float:
+        return self.area * self.rest_length
+
     def value(self, x: np.ndarray) -> np.ndarray:
         return self.linearise(x)[0]
 

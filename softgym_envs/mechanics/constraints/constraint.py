@@ -35,6 +35,10 @@ class Constraint(ABC):
         """Names and units of its rows."""
         return [Row(self.name, *self.unit)] if self.size == 1 else point_rows(self.name, self.unit[0])
 
+    def rest_size(self) -> float:
+        """Return what displacements compare with: a length [m] or volume [m3] at rest; NaN for angles and positions."""
+        return np.nan
+
     @abstractmethod
     def value(self, x: np.ndarray) -> np.ndarray:
         """Return delta, shape (size,), at node positions ``x`` [m], shape (n, 3)."""
