@@ -36,6 +36,8 @@ OFF_REST = 0.05
 """Distance from ``effector_rest`` that counts as wrong, in sizes of the robot."""
 LAYERS: Mapping[str, int] = {"quadratic": 1, "averaged": 3, "linear": 4}
 """Fewest layers of elements in a wall that bends, by element."""
+NEAR = 0.05
+"""Reach of contact that does not matter, in thicknesses of the thinnest wall."""
 SURVEYED = 200
 """Boundary triangles from which the thickness of walls is measured."""
 
@@ -131,11 +133,13 @@ def _effector(robot: Robot, rest: Equilibrium) -> Finding:
 
 
 def _walls(model: MechanicalModel) -> Iterator[Finding]:
-    """Compare the thinnest walls of each solid with the size of its elements."""
+    """Compare the thinnest walls of each solid with the size of its elements, and with the reach of contact."""
+    thinnest = np.inf
     for number, block in enumerate(model.solids):
         kind = next(name for name, solid in SOLIDS.items() if type(block) is solid)
         needed = LAYERS[kind]
         thickness, layers = wall_layers(model.nodes, block)
+        thinnest = min(thinnest, thickness)
         name = f"walls of solid {number}" if len(model.solids) > 1 else "walls"
         text = f"thinnest {1e3 * thickness:.3g} mm, {layers:.1f} layers of {kind} elements across it"
         if layers > needed - 0.01:
@@ -144,6 +148,16 @@ def _walls(model: MechanicalModel) -> Iterator[Finding]:
             yield Finding(
                 name, "note", text, f"at least {needed} where the wall bends: smaller elements, or element='quadratic'"
             )
+    if model.contact is not None and np.isfinite(thinnest):
+        reach = model.contact.distance
+        text = f"acts up to {1e3 * reach:.3g} mm outside of the body, {reach / thinnest:.0%} of its thinnest wall"
+        if reach <= NEAR * thinnest:
+            yield Finding("contact", "good", text)
+        else:
+            remedy = (
+                f"where this counts, contact_distance = {NEAR * thinnest:.2g} m or less; smaller ones take more steps"
+            )
+            yield Finding("contact", "note", text, remedy)
 
 
 def wall_layers(nodes: np.ndarray, block: SolidBlock) -> tuple[float, float]:

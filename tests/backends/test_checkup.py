@@ -7,7 +7,7 @@ import pytest
 
 from softgym_envs import DesignSpace, DesignVariable
 from softgym_envs.backends.checkup import check_robot, wall_layers
-from softgym_envs.mechanics import MechanicalModel
+from softgym_envs.mechanics import MechanicalModel, Plane
 from softgym_envs.robots import Actuator, Robot
 from softgym_envs.testing import box_mesh
 
@@ -57,6 +57,14 @@ class Slack(Beam):
     effort_scale = np.full(2, 1e5)
 
 
+class Touching(Beam):
+    def __init__(self):
+        super().__init__(contact_distance=1e-3)
+
+    def own_obstacles(self, model, design):
+        return [Plane((0.0, 0.0, -0.01), (0.0, 0.0, 1.0))]
+
+
 class Limited(Beam):
     actuators = tuple(Actuator(name, low=0.0, high=0.003, rate=0.0005, max_effort=1e-3) for name in ("upper", "lower"))
 
@@ -79,6 +87,7 @@ def test_a_sound_robot_has_no_fault():
         (Elsewhere, "effector", "note", "set it to [0.06, 0.005, 0.01] m"),
         (Feeble, "efforts", "note", "effort_scale (0.001) is too small"),
         (Slack, "actuators", "fault", "nothing holds it"),
+        (Touching, "contact", "note", "up to 1 mm outside of the body, 10% of its thinnest wall"),
         (Limited, "surrogate", "note", "beyond max_effort"),
         (Limited, "efforts", "note", "beyond max_effort = 0.001 N"),
     ],
