@@ -6,9 +6,12 @@ import gymnasium
 import numpy as np
 import pytest
 
+from softgym_envs import DesignSpace, DesignVariable
 from softgym_envs.errors import ConfigError
 from softgym_envs.mechanics import MechanicalModel
+from softgym_envs.robots import Actuator, Robot
 from softgym_envs.testing import box_mesh
+from softgym_envs.viewer import scene
 from softgym_envs.viewer.paraview import ParaviewWriter, _volume
 from softgym_envs.viewer.recording import watch_rollout
 
@@ -63,3 +66,37 @@ def test_a_folder_with_files_is_refused(series):
     folder, _ = series
     with pytest.raises(ConfigError, match="is not empty"):
         ParaviewWriter(gymnasium.make("SoftGym/FingerReach-v0").unwrapped.robot, folder)
+
+
+class Balloon(Robot):
+    """A cube with a hole, into which air is pumped."""
+
+    name, effectors, size = "balloon", ("top",), 0.03
+    design_space = DesignSpace(DesignVariable("young_modulus", 1e5, 5e5, 2e5, "Pa", "stiffness"))
+    actuators = (Actuator("air", 0.0, 5e-8, 5e-8, unit="m3"),)
+    effector_rest, effort_scale = np.array([0.015, 0.015, 0.03]), np.array([1e4])
+
+    def assemble(self, design):
+        nodes, tetrahedra = box_mesh((0.03, 0.03, 0.03), (3, 3, 3))
+        hole = (np.abs(nodes[tetrahedra].mean(axis=1) - 0.015) < 0.005).all(axis=1)
+        fixed = nodes[:, 2] < 1e-9
+        model = MechanicalModel.from_mesh(nodes, tetrahedra[~hole], fixed=fixed, element="quadratic", **design)
+        model.add_cavity("air", inside=[0.015, 0.015, 0.015])
+        model.add_effector("top", [0.015, 0.015, 0.03])
+        return model
+
+
+def test_chambers_carry_their_pressure_and_are_seen(tmp_path, monkeypatch):
+    env = gymnasium.make("SoftGym/Reach-v0", robot=Balloon, backend="fem", render_mode="rgb_array")
+    with ParaviewWriter(env.unwrapped.robot, tmp_path / "series") as writer:
+        watch_rollout(env, lambda observation, body: np.ones(1), [writer], seed=0, steps=1)
+    state = env.unwrapped.state
+    walls = pyvista.read(tmp_path / "series" / "chambers" / "0001.vtp")
+    np.testing.assert_allclose(walls["pressure"], state.effort[0])
+    assert state.effort[0] > 0.0
+    assert walls.volume == pytest.approx(1e-6 + 5e-8, rel=0.01)  # flat triangles in place of quadratic ones
+    seen = env.render().astype(int)
+    monkeypatch.setattr(scene, "chamber_skins", lambda model, x: {})
+    unseen = env.render().astype(int)
+    env.close()
+    assert (np.abs(seen - unseen).max(axis=2) > 10).mean() > 0.02  # the chamber shines through the skin
