@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from softgym_envs.mechanics import Statics
+from softgym_envs.viewer.surface import cable_radius
 
 FOLDER = Path(__file__).parents[1] / "examples" / "robots"
 ROBOTS = {"pneunet": "PneuNet", "finray": "FinRay", "tendon_arm": "TendonArm"}
@@ -60,3 +61,8 @@ def test_balanced_tendons_bend_the_arm_with_moderate_tensions(made):
         state = statics.solve(command)
         assert state.effort[:6].max() < 100.0
         assert np.linalg.norm(state.condensed.delta.e - robot.effector_rest) > 0.01
+
+
+def test_tendons_do_not_hide_the_rod_in_pictures(made):
+    assert cable_radius(made("tendon_arm").build(), 0.0027) == pytest.approx(0.001, rel=1e-6)  # an eighth of 8 mm
+    assert cable_radius(made("pneunet").build(), 0.0007) == 0.0007  # one tendon

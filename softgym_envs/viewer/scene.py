@@ -13,7 +13,7 @@ from softgym_envs.extras import require
 from softgym_envs.mechanics.contact.obstacles import Plane
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Robot
-from softgym_envs.viewer.surface import BodySurface, cable_lines, chamber_skins, surface_kinds
+from softgym_envs.viewer.surface import BodySurface, cable_lines, cable_radius, chamber_skins, surface_kinds
 
 if TYPE_CHECKING:
     import pyvista
@@ -334,6 +334,7 @@ class Scene:
         if model is not self._model:
             self._model = model
             self._surface = BodySurface(model)
+            self._thickness = cable_radius(model, 0.009 * self._length)
             self._skin = _surface_mesh(self._surface)
             kinds = [COLORS["body"], COLORS["clamp"], COLORS["object"]]
             colors = np.array(kinds, dtype=np.uint8)[surface_kinds(self._surface)]
@@ -381,11 +382,11 @@ class Scene:
             slack = bool(state.slack[row])
             share = state.effort[row] / self.robot.effort_scale[row]
             color = COLORS["cable slack"] if slack else effort_color("cable", share)
-            radius = (0.006 if slack else 0.009) * self._length
+            radius = (0.67 if slack else 1.0) * self._thickness
             line = self._seen(line)
             tube = _polyline(line).tube(radius=radius, n_sides=12, capping=True)
             tube.point_data.active_normals = tube.point_data["TubeNormals"]
-            bead = self._balls(line[:1], 0.018 * self._length)
+            bead = self._balls(line[:1], 2.0 * self._thickness)
             self._cables[row].show(tube.append_polydata(bead), color)
         self._draw_chambers(x, state)
         self._effectors.show(self._balls(self._seen(state.effector), 0.026 * self._length))

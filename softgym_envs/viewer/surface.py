@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial.distance import cdist
 
 from softgym_envs.backends.backend import State
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError
+from softgym_envs.mechanics.constraints.cable import Cable
 from softgym_envs.mechanics.constraints.cavity import Cavity
 from softgym_envs.mechanics.elements.tetrahedra import boundary_triangles
 from softgym_envs.mechanics.model import MechanicalModel
@@ -125,6 +128,13 @@ def cable_lines(
             lines[row] = np.vstack([end, slacken(path, state.displacement[row] - pulled[row], side)])
         row += constraint.size
     return lines
+
+
+def cable_radius(model: MechanicalModel, largest: float) -> float:
+    """Return the radius of a body's cables in pictures [m]: at most ``largest`` and an eighth of their distance."""
+    paths = [constraint.path(model.nodes) for constraint in model.constraints["a"] if isinstance(constraint, Cable)]
+    gaps = [cdist(one, other).min() for one, other in itertools.combinations(paths, 2)]
+    return min([largest, *(0.125 * gap for gap in gaps if gap > 0.0)])
 
 
 def chamber_skins(model: MechanicalModel, x: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
