@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+from types import SimpleNamespace
+from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -145,7 +148,6 @@ def test_needs_sampled_bodies(tmp_path):
 
 def test_needs_a_batched_environment(tmp_path):
     grasp = config(environment={"id": "SoftGym/FingerGrasp-v0", "backend": "surrogate", "sample_design": ["e1"]})
-    model = make_model(grasp)
+    one_by_one: Any = SimpleNamespace(get_env=lambda: SimpleNamespace(env=gymnasium.make("SoftGym/FingerReach-v0")))
     with pytest.raises(ValueError, match="needs a batched environment, but SoftGym/FingerGrasp-v0 on backend"):
-        CriticProposer().attach(model, grasp, tmp_path)
-    model.get_env().close()
+        CriticProposer().attach(one_by_one, grasp, tmp_path)
