@@ -26,8 +26,13 @@ if TYPE_CHECKING:
 
 TIGHTNESS = 1.0
 """How fast commands follow those of the gait, in their rates over a distance to them of one rate."""
+SHORTER, LONGER = 0.4, 1.5
+"""What a step that leads to a worse gait, or to a better one, does to the length of the next."""
 FORGET, FORGET_SQUARES = 0.8, 0.95
 """Memory of the mean and of the mean square of gradients (Kingma and Ba 2015), short for a search of a few steps."""
+
+KEPT = {"gait": "gait", "best": "best", "slope": "_slope", "mean": "_mean", "square": "_square"}
+"""Arrays of an unfinished search, by their attributes."""
 
 
 class GaitConfig(Config):
@@ -52,11 +57,13 @@ class Climb(NamedTuple):
         way: ahead after the first period [m].
         by_gait: derivative by the gait, shape (p, n_a).
         by_design: by the design variables, shape (d,); none where no neighbours of the body were given.
+        value: way ahead less the charge for the way sideways [m].
     """
 
     way: float
     by_gait: np.ndarray
     by_design: np.ndarray
+    value: float
 
 
 class GaitLearner(Learner):
@@ -71,7 +78,8 @@ class GaitLearner(Learner):
         config: configuration of the training; the environment has one body, and ``num_envs`` has no effect.
 
     Attributes:
-        gait: commands of a period, -1 and 1 at the ends of the ranges, shape (p, n_a).
+        gait: the commands of a period that are tried next, -1 and 1 at the ends of the ranges, shape (p, n_a).
+        best: those of the best gait so far, which a policy has, shape (p, n_a).
         ways: way ahead of each motion so far after its first period [m].
 
     Raises:
@@ -110,31 +118,43 @@ class GaitLearner(Learner):
         self.gait = np.clip(start + config.settings.spread * self._straight(noise), -1.0, 1.0)
         self.step = 0
         self.ways: list[float] = []
-        self._mean, self._square = np.zeros_like(self.gait), np.zeros_like(self.gait)
+        self.best, self._value, self._stride, self._count = self.gait, -np.inf, 1.0, 0
+        self._slope, self._mean, self._square = (np.zeros_like(self.gait) for _ in range(3))
 
     def learn(self, target: int, progress: Callable[[int], object]) -> None:
         settings = self.config.settings
         steps = settings.period * settings.periods
         while self.step < target:
             try:
-                way, gradient, _ = self.climb()
-            except ConvergenceError:  # a gait that cannot be computed: back to a calmer one
-                self.gait *= 0.8
+                found = self.climb()
+            except ConvergenceError:  # a gait that cannot be computed
+                self._ascend(None)
             else:
-                self.ways.append(way)
-                self._ascend(gradient, len(self.ways))
+                self.ways.append(found.way)
+                self._ascend(found)
             self.step += steps
             progress(steps)
 
-    def _ascend(self, gradient: np.ndarray, count: int) -> None:
-        """Make a step of Adam."""
+    def _ascend(self, found: Climb | None) -> None:
+        """Make a step of Adam from the best gait so far; one that led to a worse gait is made again, shorter."""
         settings = self.config.settings
-        self._mean = FORGET * self._mean + (1.0 - FORGET) * gradient
-        self._square = FORGET_SQUARES * self._square + (1.0 - FORGET_SQUARES) * gradient**2
-        size = np.sqrt(self._square / (1.0 - FORGET_SQUARES**count)) + 1e-15
+        if found is not None and found.value > self._value:
+            self._value, self._stride = found.value, min(LONGER * self._stride, 1.0)
+            self.best, self._slope = self.gait, found.by_gait
+            self._count += 1
+            self._mean = FORGET * self._mean + (1.0 - FORGET) * self._slope
+            self._square = FORGET_SQUARES * self._square + (1.0 - FORGET_SQUARES) * self._slope**2
+        elif not self._count:  # the first one cannot be computed
+            self.gait = self.best = 0.8 * self.gait
+            return
+        else:
+            self._stride *= SHORTER
+            self._count, self._mean = 1, (1.0 - FORGET) * self._slope
+            self._square = (1.0 - FORGET_SQUARES) * self._slope**2
+        size = np.sqrt(self._square / (1.0 - FORGET_SQUARES**self._count)) + 1e-15
         share = min(self.step / self.config.steps, 1.0)
-        rate = (1.0 - share) * settings.learning_rate + share * settings.final_learning_rate
-        self.gait = np.clip(self.gait + rate * self._mean / (1.0 - FORGET**count) / size, -1.0, 1.0)
+        rate = self._stride * ((1.0 - share) * settings.learning_rate + share * settings.final_learning_rate)
+        self.gait = np.clip(self.best + rate * self._mean / (1.0 - FORGET**self._count) / size, -1.0, 1.0)
 
     def climb(self, neighbours: Neighbours | None = None) -> Climb:
         """Move the body from rest, and return how the gait should change.
@@ -168,7 +188,7 @@ class GaitLearner(Learner):
             carried = carried + by_command[k]
             gradient[k % settings.period] += carried * pull[k]
             carried = carried * follow[k]
-        return Climb(float(way[0]), self._straight(gradient), found.design)
+        return Climb(float(way[0]), self._straight(gradient), found.design, float(by_way @ way))
 
     def _straight(self, change: np.ndarray) -> np.ndarray:
         """Return the part of a change of the gait (p, n_a) after which both sides still do the same in turns."""
@@ -207,20 +227,24 @@ class GaitLearner(Learner):
         return {
             "actor.mu.weight": pull,
             "actor.mu.bias": np.zeros(n, dtype=np.float32),
-            "actor.clock": (self._gain * self.gait).astype(np.float32),
+            "actor.clock": (self._gain * self.best).astype(np.float32),
         }
 
     def load_weights(self, tensors: Mapping[str, np.ndarray], path: Path) -> None:
         check_weights({"actor.clock": self.gait.shape}, tensors, path)
-        self.gait = tensors["actor.clock"].astype(float) / self._gain
+        self.gait = self.best = tensors["actor.clock"].astype(float) / self._gain
 
     def state(self) -> tuple[Tensors, dict[str, Any]]:
-        kept = {"gait": self.gait, "mean": self._mean, "square": self._square}
-        return {name: value.copy() for name, value in kept.items()}, {"step": self.step, "ways": self.ways}
+        kept = {name: getattr(self, attribute).copy() for name, attribute in KEPT.items()}
+        value = self._value if self._count else None
+        meta = {"step": self.step, "ways": self.ways, "value": value, "stride": self._stride, "count": self._count}
+        return kept, meta
 
     def restore(self, tensors: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
-        self.gait, self._mean, self._square = (tensors[name].copy() for name in ("gait", "mean", "square"))
-        self.step, self.ways = int(meta["step"]), list(meta["ways"])
+        for name, attribute in KEPT.items():
+            setattr(self, attribute, tensors[name].copy())
+        self.step, self.ways, self._count = int(meta["step"]), list(meta["ways"]), int(meta["count"])
+        self._value, self._stride = meta["value"] if self._count else -np.inf, float(meta["stride"])
 
     def close(self) -> None:
         self.env.close()

@@ -70,6 +70,19 @@ def test_it_walks_farther_than_the_common_gait_and_trains_as_others_do(tmp_path)
     assert found.returns[0] > 1.2 * common.returns[0]  # charges for slip, drift and work included
 
 
+def test_a_step_that_leads_to_a_worse_gait_is_taken_back():
+    """A thin swimmer that folds: the first step from the reference gait is too long."""
+    soft = {"length": 0.2, "radius": 0.0065, "taper": 0.8, "young_modulus": 5e4}
+    swim = EnvironmentConfig(id="SoftGym/SwimmerSwim-v0", design=soft)
+    learner = GaitLearner(config(480, swim, gait={"period": 20}))
+    learner.learn(480, lambda count: None)
+    ways = np.array(learner.ways)
+    assert (np.diff(ways) < 0.0).any()
+    assert ways.max() > 1.05 * ways[0]
+    learner.gait = learner.best
+    assert learner.climb().way == pytest.approx(ways.max(), rel=0.01)
+
+
 def test_a_resumed_search_gives_the_same_gait():
     whole, first, second = (GaitLearner(config(90)) for _ in range(3))
     whole.learn(90, lambda count: None)
