@@ -1,4 +1,4 @@
-"""Helpers shared by tests and benchmarks: small meshes and bodies, derivatives, small surrogates, processes."""
+"""Helpers of tests: small meshes and bodies, derivatives, small surrogates, processes."""
 
 from __future__ import annotations
 
