@@ -27,7 +27,8 @@ class PartsBackend(FEMBackend):
     The equations are those of finite elements, and so are servos that saturate at their ``max_effort``. In motion the
     mass of a part is spread along the line between its ends, and damping is that of its stiffness at the start of each
     time step. A state is trusted if its parts are within the poses and loads that they learned, the body resists
-    enough while its actuators are held, and the errors of the parts hardly move the effectors.
+    enough while its actuators are held, there and on the way there, and the errors of the parts hardly move the
+    effectors.
 
     Args:
         robot: the robot, which touches nothing.
@@ -68,6 +69,13 @@ class PartsBackend(FEMBackend):
     def batch_class(cls, robot: Robot, options: Mapping[str, object]) -> str | None:
         return None
 
+    def reset(self, design: Mapping[str, float] | None = None) -> State:
+        self._begins = True
+        try:
+            return super().reset(design)
+        finally:
+            self._begins = False
+
     def _build(self, design: Design) -> MechanicalModel:
         return self._learned.build(design)
 
@@ -81,7 +89,10 @@ class PartsBackend(FEMBackend):
     ) -> State:
         state = super()._state(equilibrium, command, motion, still=still)
         held = np.abs(state.effort) < self.largest_efforts * SATURATED
-        judged = judge(self._statics, self.robot, equilibrium.x, equilibrium.effort, held)
+        before = 0 if self._begins else self.state.distrust
+        judged = judge(
+            self._statics, self.robot, equilibrium.x, equilibrium.effort, held, limit=self.part.limit, before=before
+        )
         return replace(state, uncertainty=judged.uncertainty, distrust=judged.distrust)
 
 
@@ -115,12 +126,9 @@ class PartsHybridBackend(PathHybridBackend):
         mass_damping: float = 0.0,
         stiffness_damping: float = 0.01,
     ) -> None:
-        self._motion: dict[str, Any] = {
+        motion: dict[str, Any] = {
             "dynamics": dynamics, "control_step": control_step, "time_step": time_step,
             "mass_damping": mass_damping, "stiffness_damping": stiffness_damping,
         }  # fmt: skip
         self.moving = dynamics
-        self._start(robot, PartsBackend(robot, design, weights, **self._motion))
-
-    def _finite_elements(self, design: Design) -> FEMBackend:
-        return FEMBackend(self.robot.learned_mesh(), design, **self._motion)
+        self._start(robot, PartsBackend(robot, design, weights, **motion), **motion)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from softgym_envs import make_robot
+from softgym_envs.backends.parts import PartsBackend
 from softgym_envs.errors import WeightsError
 from softgym_envs.mechanics.elements.parts import PoseParts
 from softgym_envs.mechanics.solvers.statics import Statics
+from softgym_envs.surrogate.domain import SOFT
 from softgym_envs.surrogate.parts.energy import LegFunction
 from softgym_envs.surrogate.parts.held_leg import HeldLeg
 from softgym_envs.surrogate.parts.leg import VARIABLES, LegScale
@@ -51,7 +55,7 @@ def test_derivatives_are_those_of_differences(function):
 def test_torch_and_numpy_agree(function):
     import torch
 
-    from softgym_envs.surrogate.parts.network import LegNetwork
+    from softgym_envs.surrogate.parts.network import ErrorNetwork, LegNetwork
 
     torch.manual_seed(0)
     net = LegNetwork(16, 3)
@@ -62,6 +66,13 @@ def test_torch_and_numpy_agree(function):
     value, gradient, _ = function.evaluate(y.detach().numpy(), second=False)
     assert value == pytest.approx(energy.detach().numpy(), abs=1e-12)
     assert gradient == pytest.approx(slope.numpy(), abs=1e-11)
+    bound = ErrorNetwork(8).double()
+    tensors = net.state_dict() | {f"errors.{name}": value for name, value in bound.state_dict().items()}
+    expected = bound(y, torch.tensor(SHAPE).expand(4, 5)).exp().detach().numpy()
+    arrays = {name: value.numpy() for name, value in tensors.items()}
+    assert LegFunction(arrays, SHAPE).errors(poses(4)) == pytest.approx(expected, rel=1e-12)
+    on_tensors = LegFunction(tensors, torch.tensor(SHAPE)).errors(torch.tensor(poses(4)))
+    assert on_tensors.numpy() == pytest.approx(expected, rel=1e-12)
 
 
 def test_the_mirror_image_has_the_same_energy(function):
@@ -206,6 +217,16 @@ def test_W_is_the_exact_derivative(learned):
         step = 1e-4 * np.eye(4)[k]
         above, below = (statics.solve(command + s).condensed.delta.e for s in (step, -step))
         assert (above - below) / 2e-4 == pytest.approx(jacobian[:, k], abs=1e-5)
+
+
+def test_what_was_soft_on_its_way_is_not_trusted_until_it_rests(tetrapod):
+    backend = PartsBackend(tetrapod)
+    command = np.array([0.1, -0.1, 0.1, 0.0])
+    assert backend.step(command).trusted
+    backend.restore(replace(backend.state, distrust=SOFT))
+    assert backend.probe(1.1 * command).distrust == SOFT
+    assert [backend.step(share * command).distrust for share in (1.1, 1.2)] == [SOFT, SOFT]
+    assert backend.reset().trusted and backend.step(command).trusted
 
 
 def test_other_folders_and_parts_are_refused(tmp_path):

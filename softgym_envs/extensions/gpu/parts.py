@@ -72,7 +72,8 @@ class TorchParts:
         self._tensors = {name: self._put(value) for name, value in self.part.tensors.items()}
         model = self._robot.build()
         self._learn_structure(model)
-        self._arm, self._tolerance = robot.workspace_scale, robot.goal_tolerance
+        self._arm = robot.workspace_scale
+        self._tolerance = min(robot.goal_tolerance, self.part.limit)
         self._scale = torch.where(self._is_spin, 1.0 / self._arm, 1.0).to(dtype)
 
     def _put(self, values: Any) -> Tensor:
@@ -154,7 +155,7 @@ class TorchParts:
                 "shape": LegScale.of(design).shape,
                 "mass": statics.linearisation.assembly.mass_matrix().rows.toarray(),
                 "loads": model.loads,
-                "wrong": np.array(self.part.wrong_of(design)),
+                "inflation": np.array(self.part.inflation_of(design)),
                 "rest_x": rest.x,
             }
             for name, value in found.items():
@@ -167,7 +168,7 @@ class TorchParts:
         gradient, tangent, motion = self._assemble(bodies, state["x"], None)
         bodies["rest_effort"] = self._efforts(gradient, motion)
         judged = self._judge(bodies, state["x"], state["held"], tangent, motion)
-        bodies["rest_effector"], bodies["rest_uncertainty"], bodies["rest_trusted"] = judged
+        bodies["rest_effector"], bodies["rest_uncertainty"], bodies["rest_trusted"], bodies["rest_soft"] = judged
         return bodies
 
     def at_rest(self, bodies: Bodies) -> State:
@@ -181,6 +182,7 @@ class TorchParts:
             "slack": torch.zeros_like(bodies["rest"], dtype=torch.bool),
             "uncertainty": bodies["rest_uncertainty"],
             "trusted": bodies["rest_trusted"],
+            "soft": bodies["rest_soft"],
             "x": x,
             "speed": torch.zeros_like(x),
             "held": torch.ones_like(bodies["rest"], dtype=torch.bool),
@@ -219,7 +221,8 @@ class TorchParts:
         else:
             x, held, effort, found = self._solve(bodies, x, held, command, None, iterations)
         _, tangent, motion = self._assemble(bodies, x, None)
-        effector, uncertainty, trusted = self._judge(bodies, x, held, tangent, motion)
+        effector, uncertainty, trusted, soft = self._judge(bodies, x, held, tangent, motion)
+        soft = soft | state["soft"]
         new_state = {
             "u": (self._angles(x) - self.middle) / self.half_range,
             "effort": effort,
@@ -227,7 +230,8 @@ class TorchParts:
             "velocity": self._effector @ speed,
             "slack": torch.zeros_like(held),
             "uncertainty": uncertainty,
-            "trusted": trusted,
+            "trusted": trusted & ~soft,
+            "soft": soft,
             "x": x,
             "speed": speed,
             "held": held,
@@ -299,12 +303,17 @@ class TorchParts:
         slopes = (bodies["forms"] @ z[:, :, None]) + bodies["linear"]
         return 0.5 * ((slopes + bodies["linear"]) * z[:, :, None]).sum((3, 4)), slopes
 
+    def _function(self, bodies: Bodies, y: Tensor) -> LegFunction:
+        """Return the energy of the parts at coordinates (B, k, 15)."""
+        B, k, _ = y.shape
+        shape = bodies["shape"][:, None].expand(-1, k, -1).expand(B, -1, -1).reshape(-1, 5)
+        return LegFunction(self._tensors, shape)
+
     def _energies(self, bodies: Bodies, y: Tensor) -> tuple[Tensor, Tensor]:
         """Return gradients (B, k, 15) and Hessians (B, k, 15, 15) of the energies of the parts at coordinates."""
         B, k, m = y.shape
-        shape = bodies["shape"][:, None].expand(-1, k, -1).expand(B, -1, -1).reshape(-1, 5)
         scale = bodies["energy"].expand(B)[:, None, None]
-        _, gradient, hessian = LegFunction(self._tensors, shape).evaluate(y.reshape(-1, m))
+        _, gradient, hessian = self._function(bodies, y).evaluate(y.reshape(-1, m))
         return scale * gradient.reshape(B, k, m), scale[..., None] * hessian.reshape(B, k, m, m)
 
     def _motion(self, x: Tensor) -> Tensor:
@@ -391,8 +400,11 @@ class TorchParts:
 
     def _judge(
         self, bodies: Bodies, x: Tensor, held: Tensor, tangent: Tensor, motion: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return effectors [m] (B, 3), their uncertainty [m] (B,), and whether they are trusted (B,), as `judge`."""
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return effectors [m] (B, 3), their uncertainty [m], and whether they are trusted and soft (B,), as `judge`.
+
+        States that came from soft ones are not trusted either.
+        """
         # Held servos do not move: their equations are replaced by stiff ones.
         still = ((self._H != 0.0).to(self.dtype) * held[:, :, None]).sum(1)
         scaled = tangent * self._scale[:, None] * self._scale
@@ -410,12 +422,15 @@ class TorchParts:
         scale = bodies["energy"].expand(len(x)).repeat_interleave(y.shape[1])
         sizes, axes = torch.linalg.eigh(stiffness)
         root = axes * torch.sqrt(scale[:, None] * torch.maximum(sizes.abs(), 2.0 * scale[:, None]))[:, None]
-        wrong = (root.transpose(1, 2) @ (back @ rates)).reshape(len(x), -1, 3)
-        uncertainty = bodies["wrong"] * wrong.square().sum((1, 2)).sqrt()
+        wrong = self._function(bodies, y).errors(y.reshape(-1, y.shape[2]))[:, None, None] * (
+            root.transpose(1, 2) @ (back @ rates)
+        )
+        uncertainty = bodies["inflation"] * wrong.reshape(len(x), -1, 3).square().sum((1, 2)).sqrt()
         gradient, _ = self._energies(bodies, y)
         known = self._known(y, gradient / bodies["energy"].expand(len(x))[:, None, None])
-        trusted = known & (values[:, 0] > bodies["softest"]) & (uncertainty <= self._tolerance)
-        return self._effector @ x, uncertainty, trusted
+        soft = ~(values[:, 0] > bodies["softest"])
+        trusted = known & ~soft & (uncertainty <= self._tolerance)
+        return self._effector @ x, uncertainty, trusted, soft
 
     def _known(self, y: Tensor, gradient: Tensor) -> Tensor:
         """Return whether all parts are at poses and under loads that they have learned, shape (B,)."""

@@ -248,8 +248,8 @@ class PoseEnergy(Protocol):
     def knows(self, y: np.ndarray, gradient: np.ndarray) -> np.ndarray:
         """Whether the energies are known at poses (k, 15) where they have gradients (k, 15), shape (k,)."""
 
-    def error(self) -> float:
-        """Return how far the tip of a part may move under the errors of its wrench, over its length."""
+    def errors(self, y: np.ndarray) -> np.ndarray:
+        """Return how far tips at poses (k, 15) may move under the errors of their wrenches, over the length, (k,)."""
 
 
 POSE = 15
@@ -379,11 +379,13 @@ class PoseParts(Parts):
         That is the motion that a wrench would cause, in size, if its port were let go.
         """
         slopes = self.slopes(x)
-        stiffness, back = self.tip_stiffness(self.coordinates(x, slopes))
+        y = self.coordinates(x, slopes)
+        stiffness, back = self.tip_stiffness(y)
         values, vectors = np.linalg.eigh(stiffness)
         motions = np.einsum("kiad,fkad->kfi", slopes, fields[:, self.port_rows]) @ back.transpose(0, 2, 1)
         roots = vectors * np.sqrt(self.scale * np.maximum(np.abs(values), SMALLEST * self.scale))[:, None]
-        return self.energy.error() * np.concatenate((motions @ roots).transpose(0, 2, 1))
+        wrong = self.energy.errors(y)[:, None, None] * (motions @ roots)
+        return np.concatenate(wrong.transpose(0, 2, 1))
 
     def viscosity(self, start: np.ndarray) -> np.ndarray:
         """Damp motions of the far port against the near one by the positive part of their stiffness at the start."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from softgym_envs.robots.base import Robot
 from softgym_envs.storage import read_json, write_json
 from softgym_envs.surrogate.calibration import conformal_quantile
 from softgym_envs.surrogate.data.strata import draw_commands
+from softgym_envs.surrogate.domain import SOFT
 from softgym_envs.surrogate.parts.trust import Judged, judge
 from softgym_envs.surrogate.parts.weights import LearnedLeg
 
@@ -31,6 +32,7 @@ class Comparison:
 
     Attributes:
         stratum: as `surrogate.data.strata.DRAWN`, shape (N,).
+        design: shape (N, number of design variables).
         command: shape (N, n_a).
         error: distance of the first effector from that of finite elements [m], shape (N,).
         effort: largest error of an effort over the largest effort, shape (N,).
@@ -39,12 +41,14 @@ class Comparison:
         uncertainty: [m], shape (N,).
         stiffness: as `Judged`, shape (N,).
         known: likewise.
+        soft: whether the body was too soft, there or on its way, shape (N,).
         trusted: shape (N,).
         lost: commands for which finite elements found no equilibrium.
         failed: commands for which the parts found none, though there is one; they count as not trusted.
     """
 
     stratum: np.ndarray
+    design: np.ndarray
     command: np.ndarray
     error: np.ndarray
     effort: np.ndarray
@@ -53,6 +57,7 @@ class Comparison:
     uncertainty: np.ndarray
     stiffness: np.ndarray
     known: np.ndarray
+    soft: np.ndarray
     trusted: np.ndarray
     lost: int
     failed: int
@@ -76,16 +81,14 @@ class Comparison:
         }
 
 
-def approach(statics: Statics, robot: Robot, command: np.ndarray) -> Equilibrium:
-    """Return the equilibrium under a command that is approached slowly from rest.
+def approach(statics: Statics, command: np.ndarray) -> Iterator[Equilibrium]:
+    """Yield the equilibria on the way to a command that is approached slowly from rest.
 
     Raises:
-        ConvergenceError: if it is not found.
+        ConvergenceError: if one is not found.
     """
-    found = statics.solve(np.zeros(len(command)))
-    for share in np.linspace(0.0, 1.0, INCREMENTS + 1)[1:]:
-        found = statics.solve(share * command)
-    return found
+    for share in np.linspace(0.0, 1.0, INCREMENTS + 1):
+        yield statics.solve(share * command)
 
 
 def compare(robot: Robot, part: LearnedLeg, *, bodies: int, seed: int, strata: tuple[str, ...] = STRATA) -> Comparison:
@@ -106,24 +109,27 @@ def compare(robot: Robot, part: LearnedLeg, *, bodies: int, seed: int, strata: t
             design = dict(zip(robot.design_space.names, values, strict=True))
             command = commands[0]
             try:
-                true = approach(Statics(robot.build(design)), robot, command).condensed
+                *_, end = approach(Statics(robot.build(design)), command)
+                true = end.condensed
             except (ConvergenceError, InfeasibleDesign):
                 lost += 1
                 continue
-            statics = Statics(learned.build(design))
+            statics, distrust = Statics(learned.build(design)), 0
             try:
-                found = approach(statics, robot, command)
+                for found in approach(statics, command):
+                    judged = judge(statics, robot, found.x, found.effort, held, limit=part.limit, before=distrust)
+                    distrust = judged.distrust
             except ConvergenceError:
                 failed += 1
                 continue
-            judged = judge(statics, robot, found.x, found.effort, held)
-            rows.append((stratum, command, *_errors(found.condensed, true), *_verdict(judged)))
+            rows.append((stratum, np.array(values), command, *_errors(found.condensed, true), *_verdict(judged)))
     columns: list[Any] = [*(np.array(column) for column in zip(*rows, strict=True)), lost, failed]
     return Comparison(*columns)
 
 
-def _verdict(judged: Judged) -> tuple[float, float, bool, bool]:
-    return judged.uncertainty, judged.stiffness, judged.known, judged.distrust == 0
+def _verdict(judged: Judged) -> tuple[float, float, bool, bool, bool]:
+    soft = bool(judged.distrust & SOFT)
+    return judged.uncertainty, judged.stiffness, judged.known, soft, judged.distrust == 0
 
 
 def _errors(found: CondensedModel, true: CondensedModel) -> tuple[float, float, float, float]:
@@ -143,7 +149,8 @@ def calibrate_parts(folder: str | Path, robot: Robot, *, bodies: int, seed: int)
     """Calibrate how far bodies of parts may be off, and write the result to the card of the weights.
 
     The errors of the parts are scaled so that the uncertainty covers 95 % of the errors of the effector, inside the
-    design box and at its corners; bodies at its faces are reported.
+    design box and at its corners, of known states that were never soft; bodies at its faces are reported. The limit of
+    the uncertainty is then lowered until no trusted state of any body is off by more than the goal tolerance.
 
     Args:
         folder: of the weights.
@@ -158,9 +165,20 @@ def calibrate_parts(folder: str | Path, robot: Robot, *, bodies: int, seed: int)
     found = compare(robot, part, bodies=bodies, seed=seed)
     path = folder / "model.json"
     trust: dict[str, float] = {"bodies": bodies, "seed": seed}
-    for name, now in zip(("inside", "corners"), part.wrong, strict=True):
-        rows = found.known & (found.stratum == name)
+    card = read_json(path)
+    for name, now in zip(("inside", "corners"), part.inflation, strict=True):
+        rows = found.known & ~found.soft & (found.stratum == name)
         trust[name] = now * conformal_quantile(found.error[rows] / found.uncertainty[rows])
-    write_json(path, {**read_json(path), "trust": trust})
-    again = compare(robot, LearnedLeg(folder), bodies=bodies, seed=seed)
+    write_json(path, {**card, "trust": trust})
+    calibrated = LearnedLeg(folder)
+    designs = [dict(zip(robot.design_space.names, row, strict=True)) for row in found.design.tolist()]
+    ratio = [calibrated.inflation_of(design) / part.inflation_of(design) for design in designs]
+    uncertainty = found.uncertainty * np.array(ratio)
+    trusted = found.known & ~found.soft & (uncertainty <= robot.goal_tolerance)
+    again = replace(found, uncertainty=uncertainty, trusted=trusted)
+    wrong = again.uncertainty[again.trusted & (again.error > robot.goal_tolerance)]
+    if len(wrong):
+        trust["limit"] = float(np.nextafter(wrong.min(), 0.0))
+        write_json(path, {**card, "trust": trust})
+        again = replace(again, trusted=again.trusted & (again.uncertainty <= trust["limit"]))
     return {stratum: again.summary(again.stratum == stratum) for stratum in STRATA}

@@ -33,11 +33,23 @@ class Judged(NamedTuple):
     distrust: int
 
 
-def judge(statics: Statics, robot: Robot, x: np.ndarray, effort: np.ndarray, held: np.ndarray) -> Judged:
+def judge(
+    statics: Statics,
+    robot: Robot,
+    x: np.ndarray,
+    effort: np.ndarray,
+    held: np.ndarray,
+    *,
+    limit: float = np.inf,
+    before: int = 0,
+) -> Judged:
     """Judge a state of a body of parts, whether it moves or not.
 
     An error of the wrench of a part moves the effector by its work along the motion that a unit force on the effector
     causes while the actuators are held.
+
+    A body that was soft on its way may have taken another branch of equilibria than finite elements, on which it is
+    stiff again: it remains untrusted until it rests.
 
     Args:
         statics: solver of the body, whose state it leaves as it is.
@@ -45,6 +57,8 @@ def judge(statics: Statics, robot: Robot, x: np.ndarray, effort: np.ndarray, hel
         x: rows, shape (n, 3).
         effort: of all constraints, shape (size,).
         held: which actuators are held, shape (n_a,).
+        limit: largest uncertainty of a trusted state [m], besides the robot's goal tolerance.
+        before: distrust of the state that it came from, 0 from rest.
     """
     model, linear = statics.model, statics.linearisation
     assembled = linear.assemble(x, effort)
@@ -69,9 +83,9 @@ def judge(statics: Statics, robot: Robot, x: np.ndarray, effort: np.ndarray, hel
     uncertainty = float(np.sqrt(total))
     stiffness = float(values[0] / max(block.scale / block.length**2 for block in parts))
     known = all(block.knows(x) for block in parts)
-    distrust = 0 if known else OUTSIDE
+    distrust = before & SOFT | (0 if known else OUTSIDE)
     if not stiffness > SOFTEST:
         distrust |= SOFT
-    if not uncertainty <= robot.goal_tolerance:
+    if not uncertainty <= min(limit, robot.goal_tolerance):
         distrust |= SPREAD
     return Judged(uncertainty, stiffness, known, distrust)

@@ -111,6 +111,8 @@ def _read(folder: Path, version: int) -> tuple[dict[str, Any], dict[str, np.ndar
         raise WeightsError(f"weights '{weights_path}' are damaged or truncated: {error}") from None
     if wrong := sorted(name for name, tensor in tensors.items() if not np.isfinite(tensor).all()):
         raise WeightsError(f"weights '{weights_path}' have values that are not finite in {', '.join(wrong)}")
+    if not any(name.startswith("errors.") for name in tensors):
+        raise WeightsError(f"weights '{weights_path}' do not know their errors: train them again")
     return card, tensors
 
 
@@ -120,14 +122,14 @@ class LegEnergy(LegFunction):
     Args:
         tensors: weights of the network.
         shape: of the legs, as for `LegFunction`.
-        wrong: how far tips may move under the errors of their wrenches, over the length.
+        inflation: factor of the errors.
     """
 
     domain = LegDomain()
 
-    def __init__(self, tensors: Mapping[str, np.ndarray], shape: np.ndarray, wrong: float) -> None:
+    def __init__(self, tensors: Mapping[str, np.ndarray], shape: np.ndarray, inflation: float) -> None:
         super().__init__(tensors, shape)
-        self._wrong = wrong
+        self._inflation = inflation
 
     def knows(self, y: np.ndarray, gradient: np.ndarray) -> np.ndarray:
         force, by_turn = gradient[..., PLACE], gradient[..., TURN].reshape(-1, 3, 3)
@@ -135,8 +137,8 @@ class LegEnergy(LegFunction):
         moment = np.cross(turn, by_turn, axis=1).sum(axis=2)
         return self.domain.contains(y) & self.domain.carries(np.concatenate([force, moment], axis=-1))
 
-    def error(self) -> float:
-        return self._wrong
+    def errors(self, y: np.ndarray) -> np.ndarray:
+        return self._inflation * super().errors(y)
 
 
 class LearnedLeg:
@@ -149,7 +151,8 @@ class LearnedLeg:
         card: of the weights.
         tensors: the weights, by the names of `LegNetwork`.
         domain: poses and loads that it has learned.
-        wrong: see `wrong_of`, inside the box of dimensions and at its corners.
+        inflation: see `inflation_of`, inside the box of dimensions and at its corners.
+        limit: largest uncertainty of a trusted state [m]; infinite if only the goal tolerance limits it.
 
     Raises:
         WeightsError: as `read_leg`.
@@ -159,28 +162,28 @@ class LearnedLeg:
 
     def __init__(self, folder: str | Path | None = None) -> None:
         self.card, self.tensors = read_leg(folder)
-        usual = float(self.card["test"]["moved_p95"])
         trust = self.card.get("trust", {})
-        self.wrong = float(trust.get("inside", usual)), float(trust.get("corners", usual))
+        self.inflation = float(trust.get("inside", 1.0)), float(trust.get("corners", 1.0))
+        self.limit = float(trust.get("limit", np.inf))
         bounds = [self.card["design_variables"][name] for name in VARIABLES]
         self._low, self._high = (np.array([bound[k] for bound in bounds], dtype=float) for k in (0, 1))
 
-    def wrong_of(self, design: Mapping[str, float]) -> float:
-        """Return how far the tips of a body's legs may move under the errors of their wrenches, over the length.
+    def inflation_of(self, design: Mapping[str, float]) -> float:
+        """Return the factor of the errors of a body's legs.
 
         The logarithm is linear in the share of dimensions at their bounds, as in `softgym_envs.surrogate.domain`.
         """
         values = np.array([design[name] for name in VARIABLES])
         away = np.abs(2.0 * values - self._low - self._high) / (self._high - self._low)
         share = float(np.clip((away - 1.0) / EDGE + 1.0, 0.0, 1.0).mean())
-        inside, corners = self.wrong
+        inside, corners = self.inflation
         return float(inside ** (1.0 - share) * corners**share)
 
     def __call__(self, design: Mapping[str, float], gravity: np.ndarray) -> dict[str, Any]:
         """Return the options of `PoseParts` for the legs of a body."""
         scale = LegScale.of(design)
         return {
-            "energy": LegEnergy(self.tensors, scale.shape, self.wrong_of(design)),
+            "energy": LegEnergy(self.tensors, scale.shape, self.inflation_of(design)),
             "length": float(scale.length),
             "scale": float(scale.energy),
             "weight": float(scale.weight) * gravity,
