@@ -36,8 +36,8 @@ class EnvironmentConfig(Config):
     """An environment by its ID, or a robot with a task, and the options of ``gymnasium.make``.
 
     A robot and a task are registered names or paths such as ``my_module:MyRobot``; in Python they may be classes, which
-    are stored as their paths. With ``residual_scale`` the agent corrects the inverse QP: the executed action is
-    ``clip(QP action + residual_scale * agent action, -1, 1)``.
+    are stored as their paths. With ``residual_scale`` the agent corrects the inverse QP, or what stands for it in the
+    task (`Task.qp_agent`): the executed action is ``clip(QP action + residual_scale * agent action, -1, 1)``.
 
     Attributes:
         id: ID of an environment, in place of robot and task.

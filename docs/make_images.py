@@ -14,6 +14,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from site_writing import DOCS, environment_pages
 
 from softgym_envs import make_robot
 from softgym_envs.agents.evaluation import make_agent
+from softgym_envs.agents.policy import Policy
 from softgym_envs.backends import make_backend
 from softgym_envs.extensions.leaderboard import plots
 from softgym_envs.extensions.modules import MODULES
@@ -64,11 +66,18 @@ SHOWN = ("finger_reach", "trunk_track", "gripper_lift")
 """Environments of the animation of the home page."""
 FILM_SIZE, FILM_FRAMES = (360, 300), 30
 FILM_AGENTS = {
-    "finger_grasp": "force", "gripper_lift": "close", "quadruped_walk": "gait", "swimmer_swim": "gait",
+    "finger_grasp": "force", "gripper_lift": "close", "quadruped_climb": "gait", "quadruped_walk": "gait",
+    "swimmer_swim": "gait",
     "tetrapod_carry": "tetrapod_carry",
 }  # fmt: skip
 """Agents of the films of environments, where it is not the inverse QP."""
-FILM_STEPS = {"gripper_lift": 50, "quadruped_walk": 100, "swimmer_swim": 100, "tetrapod_carry": 60}
+FILM_STEPS = {
+    "gripper_lift": 50, "quadruped_climb": 100, "quadruped_walk": 100, "swimmer_swim": 100, "tetrapod_carry": 60,
+}  # fmt: skip
+WALKERS = {"baseline": "quadruped_walk_gait", "winner": "quadruped_walk_winner"}
+"""Policies of the film of walkers, each for its own body."""
+STRIP, WALKED = (800, 170), 5.5
+"""Size of the picture of a walker [pixels], and the way that it shows [sizes of the robot]."""
 OPTIONS: dict[str, dict[str, Any]] = {
     "finger_grasp": {"backend": "fem", "robot_options": {"object": "hexagon"}},  # easier to see than a plane
     "modular_reach": {"backend": "fem", "robot_options": {"body": "solid"}},  # superelements are drawn as bars
@@ -117,6 +126,32 @@ def draw_episodes(path: Path) -> None:
             films.append(images)
     length = max(map(len, films))
     write_video(path, [np.concatenate([f[min(k, len(f) - 1)] for f in films], axis=1) for k in range(length)], fps=8.0)
+
+
+def draw_walkers(path: Path) -> None:
+    """Write a film of the quadrupeds of `WALKERS`, one above the other."""
+    strips, speeds = [], []
+    for agent in WALKERS.values():
+        environment = Policy(agent).environment
+        env = environment.make()
+        observation, _ = env.reset(seed=0)
+        unwrapped: Any = env.unwrapped
+        unwrapped.robot.view = replace(unwrapped.robot.view, way=WALKED)
+        act, renderer = make_agent(agent), ImageRenderer(unwrapped.robot, STRIP, source=unwrapped.backend)
+        images, steps = [], unwrapped.task.max_episode_steps
+        for step in range(steps + 1):
+            if step % 2 == 0:
+                place = unwrapped.state.effector
+                text = f"{step * unwrapped.backend.steps.control_step:.1f} s"
+                images.append(renderer.render(unwrapped.design, unwrapped.state, place, place[0], text=text))
+            if step < steps:
+                observation, *_, info = env.step(act(observation, unwrapped))
+        renderer.close()
+        strips.append(images)
+        speeds.append(1e3 * float(info["speed"]))
+    print(*(f"{name}: {speed:.0f} mm/s" for name, speed in zip(WALKERS, speeds, strict=True)), sep="\n")
+    frames = [np.concatenate(pair, axis=0) for pair in zip(*strips, strict=True)]
+    write_video(path, frames + [frames[-1]] * 8, fps=10.0)
 
 
 def draw_grasp() -> np.ndarray:
@@ -188,14 +223,15 @@ def main(names: list[str]) -> None:
     table |= {"benchmark_regret": plots.draw_regret, "benchmark_winners": plots.draw_winners}
     table |= {name: partial(draw_robot, name) for name in ROBOTS if name not in WITHOUT_REST}
     films = [f"{name}.webp" for name in environment_pages()]
-    every = [*table, *films, "episodes"]
+    films_of_more = {"episodes": draw_episodes, "walkers": draw_walkers}
+    every = [*table, *films, *films_of_more]
     if unknown := [name for name in names if name not in (*every, "report")]:
         raise SystemExit(f"unknown pictures {', '.join(unknown)}; allowed: {', '.join(every)}, report")
     for name in names or every:
         path = DOCS / "images" / f"{name.removesuffix('.webp')}.png"
-        if name == "episodes":
+        if name in films_of_more:
             path = path.with_suffix(".webp")
-            draw_episodes(path)
+            films_of_more[name](path)
         elif name.endswith(".webp"):
             path = path.with_suffix(".webp")
             draw_film(name.removesuffix(".webp"), path)

@@ -169,7 +169,7 @@ def _check_quantities(robot: Robot) -> None:
             furthest, label = max(variable.low, variable.high, key=abs), f"{owner}design variable '{variable.name}'"
             check_quantity("length", furthest, label, high=DIMENSIONS * size, example=f"{DIMENSIONS:g} sizes")
     narrower = {
-        "mass": _plausible_mass(robot),
+        "mass": plausible_mass(robot),
         "contact_distance": (0.1 * size, "a tenth of the robot"),
         "length": (STROKES * size, f"{STROKES:g} sizes of the robot"),
         "force": (plausible_force(robot), "for its actuators"),
@@ -180,7 +180,7 @@ def _check_quantities(robot: Robot) -> None:
             check_quantity(OPTIONS[name], value, f"{owner}{name}", high=high, example=example)
 
 
-def _plausible_mass(robot: Robot) -> tuple[float, str]:
+def plausible_mass(robot: Robot) -> tuple[float, str]:
     """Return the largest plausible mass that a robot carries [kg], and why, for messages."""
     lifted, carried = plausible_force(robot) / 9.81, CARRIED * robot.size**3
     if lifted < carried:
@@ -189,13 +189,15 @@ def _plausible_mass(robot: Robot) -> tuple[float, str]:
 
 
 def plausible_force(robot: Robot) -> float:
-    """Return the largest plausible force on a robot [N]: ten times what its actuators can do together."""
-    per_unit = {"m": 1.0, "rad": 1.0 / robot.size, "m3": (0.3 * robot.size) ** 2}
-    if any(actuator.unit not in per_unit for actuator in robot.actuators):
-        return np.inf
-    return 10.0 * sum(
-        scale * per_unit[each.unit] for each, scale in zip(robot.actuators, robot.effort_scale, strict=True)
-    )
+    """Return the largest plausible force on a robot [N]: ten times what its actuators can do together.
+
+    A pressure acts on the face of a cube as large as the volume that its actuator can push.
+    """
+    forces = []
+    for each, scale in zip(robot.actuators, robot.effort_scale.tolist(), strict=True):
+        per_unit = {"m": 1.0, "rad": 1.0 / robot.size, "m3": (each.high - each.low) ** (2.0 / 3.0)}
+        forces.append(scale * per_unit.get(each.unit, np.inf))
+    return 10.0 * sum(forces)
 
 
 def _is_number(value: object) -> bool:

@@ -427,6 +427,8 @@ def test_goals_repeat_and_belong_to_the_body():
         "tetrapod_carry",
         "tetrapod_carry_kilogram",
         "tetrapod_reach_analytic",
+        "quadruped_walk_gait",
+        "quadruped_walk_winner",
     ],
 )
 def test_shipped_policies_were_made_by_the_shipped_configs(name):

@@ -14,6 +14,8 @@ BACKENDS = ("fem", "surrogate", "hybrid")
 GROUND = "no weights ship for 'quadruped', which touches something: use backend='fem'"
 HOLES = {
     # Contact with the ground is not learned.
+    ("SoftGym/QuadrupedClimb-v0", "surrogate"): GROUND,
+    ("SoftGym/QuadrupedClimb-v0", "hybrid"): GROUND,
     ("SoftGym/QuadrupedWalk-v0", "surrogate"): GROUND,
     ("SoftGym/QuadrupedWalk-v0", "hybrid"): GROUND,
     # Nothing holds it, so it has no equilibria to learn.

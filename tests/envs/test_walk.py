@@ -109,6 +109,26 @@ def test_a_payload_weighs_on_the_feet():
     assert rest[0.05][0] - rest[0.0][0] == pytest.approx(-rest[0.05][1], rel=1e-6)
 
 
+def test_each_episode_draws_its_ground():
+    """Where a robot slides downhill says its friction, and how it stands its slope; payloads hang along gravity."""
+    env = gymnasium.make(ID, task_options={"friction": [0.3, 1.0], "slope": [0.0, 0.2], "payload": 0.03}).unwrapped
+    grounds = []
+    for seed in (0, 1):
+        env.reset(seed=seed)
+        for _ in range(10):
+            info = env.step(STAND)[4]
+        model, carried = env.backend.model, env.task.load.carried
+        assert np.cross(model.gravity, carried) == pytest.approx(0.0, abs=1e-12)
+        # What the ground carries is the weight of robot and payload along the slope's own axes.
+        force, mass = info["contact_force"][0], 0.05 + 4.0 * 1070.0 * np.pi * 0.008**2 * 0.055
+        assert force == pytest.approx(-mass * model.gravity - carried, abs=2e-3 * np.linalg.norm(force))
+        grounds.append((model.contact.obstacles[0].friction, model.gravity[0]))
+    (one, steep), (other, flat) = grounds
+    assert one != other and steep != flat and np.linalg.norm(model.gravity) == pytest.approx(9.81)
+    env.reset(seed=0)
+    assert (env.backend.model.contact.obstacles[0].friction, env.backend.model.gravity[0]) == grounds[0]
+
+
 def test_a_moment_can_be_restored():
     env = gymnasium.make(ID).unwrapped
     env.reset(seed=0)
@@ -165,6 +185,12 @@ def test_vector_environments_walk_alike():
         ({"push": -1.0}, "push = -1.0"),
         ({"push_steps": 0}, "push_steps = 0 is out of bounds; allowed: 1 to 99 control steps"),
         ({"push_steps": 100}, "push_steps = 100 is out of bounds"),
+        ({"payload": 20.0}, r"payload = 20 kg is implausible, allowed: 0 to 2 kg"),
+        ({"push": 100.0}, r"push = 100 N is implausible"),
+        ({"friction": (1.0, 0.5)}, r"friction = \(1.0, 0.5\) must be a number or a range"),
+        ({"friction": "icy"}, "friction = icy must be a number or a range"),
+        ({"slope": (0.0, 0.6)}, "allowed: -0.5 to 0.5 rad"),
+        ({"slope": 0.4, "friction": (0.3, 1.0)}, "slope = 0.4 rad is too steep for friction"),
     ],
 )
 def test_wrong_options(options, words):
