@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import functools
 import inspect
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import PurePath
@@ -22,6 +23,7 @@ from softgym_envs.robots.checks import (
     check_built,
     check_defined,
     check_robot,
+    warn_unknown,
     warn_unread,
 )
 from softgym_envs.robots.mesh_tiers import FOLLOWING, UNIFORM
@@ -64,6 +66,7 @@ def _recording_options(init: F) -> F:
         init(self, *args, **kwargs)
         if outermost:
             check_robot(self)
+            warn_unknown(self, Robot)
 
     return wrapper  # type: ignore[return-value]
 
@@ -247,13 +250,14 @@ class Robot(ABC):
 
         complete = self.design_space.complete(design)
         try:
-            watched = WatchedDesign(complete)
+            watched, began = WatchedDesign(complete), time.perf_counter()
             with locking_accepted(self._has_built or self.reproduces_scene):
                 model = self.assemble(watched)
-            self._has_built = True
+            seconds, self._has_built = time.perf_counter() - began, True
             check_built(self, model, complete)
             self._add_contact(model, watched)
-            warn_unread(self, watched)
+            with locking_accepted():
+                warn_unread(self, model, watched, seconds)
             return model
         except SoftGymError:
             raise
@@ -337,7 +341,12 @@ class Robot(ABC):
     @property
     def may_touch(self) -> bool:
         """Whether options of contact matter."""
-        return self.touches or type(self).own_obstacles is not Robot.own_obstacles
+        return self.touches or self.has_own_obstacles
+
+    @property
+    def has_own_obstacles(self) -> bool:
+        """Whether rigid objects are part of the robot."""
+        return type(self).own_obstacles is not Robot.own_obstacles
 
     @property
     def options(self) -> dict[str, object]:

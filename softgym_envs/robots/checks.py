@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 import warnings
-from collections.abc import Iterator, Mapping
+from collections import deque
+from collections.abc import ItemsView, Iterator, KeysView, Mapping, ValuesView
 from dataclasses import replace
+from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any
 from weakref import WeakSet
 
@@ -71,6 +74,19 @@ LARGEST_RATIO = 8.0
 """Ratio of a robot's size and the extent of its baseline body, either way, beyond which one has a wrong unit."""
 
 _REQUIRED = ("name", "effectors", "size", "design_space", "actuators", "effector_rest", "effort_scale")
+
+_WRITTEN_OTHERWISE = {
+    **{name: f"learning = Learning({name}=...)" for name in ("stiffness_variable", "convex", "symmetries")},
+    "learned_parts": "learning = Learning(parts=...)",
+    "sealed": "sensing = Sensing(sealed=...)",
+    "sensor_scale": "sensing = Sensing(scale=...)",
+    "sensor_unit": "sensing = Sensing(unit=...)",
+    "picture_axes": "view = View(axes=...)",
+}
+"""How the attributes of a robot are written that stand in one of its objects, or have another name."""
+
+UNREAD_SECONDS = 2.0
+"""Time that may be spent once on bodies by which variables that are passed on together are watched [s]."""
 
 
 def check_defined(holder: object, cls: type) -> None:
@@ -227,27 +243,50 @@ class WatchedDesign(Design):
     """A design that notes which of its variables are read.
 
     Attributes:
-        read: names of the variables read so far.
+        read: names of the variables read one by one so far.
+        passed_on: names of those read all together, as by ``**design``, which says nothing about their use.
     """
 
-    __slots__ = ("_array", "read")
+    __slots__ = ("_array", "_copying", "passed_on", "read")
 
     def __init__(self, design: Design) -> None:
         self.read: set[str] = set()
+        self.passed_on: set[str] = set()
+        self._copying: deque[str] = deque()
         self.space, self._values, self._array = design.space, dict(design), design.array
 
     @property
     def array(self) -> np.ndarray:  # type: ignore[override]
         """All values, which are read thereby."""
-        self.read.update(self.space.names)
+        self.passed_on.update(self.space.names)
         return self._array
 
     def __getitem__(self, name: str) -> float:
-        self.read.add(name)
+        if self._copying and name == self._copying[0]:
+            self._copying.popleft()
+            self.passed_on.add(name)
+        else:
+            self._copying.clear()
+            self.read.add(name)
         return self._values[name]
 
+    def keys(self) -> KeysView[str]:
+        """Return the names; ``dict(design)`` and ``**design`` then read each of them in turn."""
+        self._copying = deque(self._values)
+        return self._values.keys()
+
+    def items(self) -> ItemsView[str, float]:
+        """Return names and values, which are read thereby."""
+        self.passed_on.update(self._values)
+        return self._values.items()
+
+    def values(self) -> ValuesView[float]:
+        """Return all values, which are read thereby."""
+        self.passed_on.update(self._values)
+        return self._values.values()
+
     def __hash__(self) -> int:  # as a key of a cache, which may know the answer to all that would be read
-        self.read.update(self.space.names)
+        self.passed_on.update(self.space.names)
         return super().__hash__()
 
     def __iter__(self) -> Iterator[str]:
@@ -331,17 +370,82 @@ _WATCHED: WeakSet[type] = WeakSet()
 """Classes of robots whose reading of designs has been watched."""
 
 
-def warn_unread(robot: Robot, design: WatchedDesign) -> None:
-    """Warn of design variables that `assemble` did not read, once for each class.
+def warn_unread(robot: Robot, model: MechanicalModel, design: WatchedDesign, seconds: float) -> None:
+    """Warn of design variables that change nothing, once for each class: those that `assemble` never reads.
 
+    Where variables are passed on together, the body with another value of each is compared, unless that takes long.
     What chooses among parts may leave others unread.
+
+    Args:
+        robot: the robot.
+        model: what its `assemble` returned.
+        design: the watched design from which it did.
+        seconds: how long that took.
     """
     if type(robot) in _WATCHED or any(variable.choices for variable in robot.design_space):
         return
     _WATCHED.add(type(robot))
-    if unread := [name for name in robot.design_space.names if name not in design.read]:
+    known = [name for name in robot.design_space.names if name not in design.read]
+    unread = [name for name in known if name not in design.passed_on]
+    passed_on = [name for name in known if name in design.passed_on]
+    if passed_on and seconds * len(passed_on) < UNREAD_SECONDS and not robot.has_own_obstacles:
+        numbers = _numbers_of(model)
+        unread += [name for name in passed_on if _same(numbers, robot, _moved(design, name))]
+    if unread:
         warnings.warn(
             f"robot '{robot.name}': assemble never reads the design variable{'s' if len(unread) > 1 else ''} "
             f"{', '.join(unread)}: {'they change' if len(unread) > 1 else 'it changes'} nothing",
             stacklevel=4,
+        )
+
+
+def _moved(design: Design, name: str) -> Design:
+    """Return a design with another value of one variable."""
+    variable = design.space[name]
+    low, high = (abs(end - design._values[name]) for end in (variable.low, variable.high))
+    end = variable.high if high > low else variable.low
+    return Design(design.space, {**design._values, name: 0.7 * design._values[name] + 0.3 * end})
+
+
+def _same(numbers: list[np.ndarray], robot: Robot, design: Design) -> bool:
+    """Whether `assemble` makes a body of the same numbers from another design."""
+    try:
+        other = _numbers_of(robot.assemble(design))
+    except Exception:  # of this other body, which nobody asked for
+        return False
+    return len(other) == len(numbers) and all(map(np.array_equal, numbers, other))
+
+
+def _numbers_of(model: MechanicalModel) -> list[np.ndarray]:
+    """Return what a body is: its shape, loads, masses, rows of `W`, and its energy in a strained shape."""
+    constraints = [constraint for group in model.constraints.values() for constraint in group]
+    strained = model.nodes * (1.0 + 1e-3 * np.sin(np.arange(1.0, 4.0) + 1e3 * model.nodes))
+    blocks = [np.array([block.mass, block.volume]) for block in model.blocks]
+    rows = [np.append(constraint.value(strained), constraint.compliance) for constraint in constraints]
+    extra = [np.array([model.elastic_energy(strained)]), model.fixed, model.loads, model.nodes]
+    return [*extra, *blocks, *rows]
+
+
+_TOLD: WeakSet[type] = WeakSet()
+"""Classes of robots whose attributes have been looked at."""
+
+
+def warn_unknown(robot: Robot, base: type) -> None:
+    """Warn once for each class of attributes that nothing reads, which are nearly those of ``base``."""
+    cls = type(robot)
+    if cls in _TOLD:
+        return
+    _TOLD.add(cls)
+    known = {name for name in (*dir(base), *inspect.get_annotations(base)) if not name.startswith("_")}
+    defined = {name for each in cls.__mro__ if not issubclass(base, each) for name in vars(each)}
+    own = {name for name in defined | set(vars(robot)) if not name.startswith("_")}
+    for name in sorted(own - known - set(robot.options)):
+        if name in _WRITTEN_OTHERWISE:
+            meant = _WRITTEN_OTHERWISE[name]
+        elif name in defined and len(name) > 5 and (near := get_close_matches(name, known, n=1, cutoff=0.9)):
+            meant = near[0]
+        else:
+            continue
+        warnings.warn(
+            f"robot '{robot.name}': nothing reads its attribute '{name}'; did you mean '{meant}'?", stacklevel=4
         )

@@ -353,15 +353,56 @@ def test_design_variables_that_assemble_never_reads_are_named_once():
     make_robot(Spike).build()  # nothing to tell
 
 
-@pytest.mark.parametrize("use", [dict, lambda design: design.array, hash, lambda design: {**design}, str])
-def test_using_a_whole_design_reads_its_variables(use):
-    def assemble(self, design):
-        use(design)
-        return Spike.assemble(self, dict(Spike.design_space.baseline))
+def _as_keywords(design):
+    return (lambda **values: values)(**design)
 
-    robot = type("Whole", (Spike,), {"name": "whole", "assemble": assemble})()
-    if use is str:
-        with pytest.warns(UserWarning, match="never reads the design variable length"):
+
+@pytest.mark.parametrize(
+    "copy",
+    [dict, _as_keywords, lambda design: {**design}, lambda design: dict(design.items())]
+    + [lambda design: dict(zip(design, design.values(), strict=True))]
+    + [lambda design: design.space.complete(design.space.from_unit(design.space.to_unit(dict(design))))]
+    + [lambda design: dict(zip(design.space.names, design.array, strict=True))],
+)
+@pytest.mark.parametrize("unused", [None, "widht"])
+def test_variables_that_are_passed_on_together_are_watched(copy, unused):
+    space = DesignSpace(*Spike.design_space, DesignVariable("widht", 0.01, 0.02, 0.01, "m", "never read"))
+
+    def assemble(self, design):
+        values = copy(design)
+        model = Spike.assemble(self, {name: values[name] for name in Spike.design_space.names})
+        if unused is None:
+            model.nodal_loads[-1] += values["widht"]
+        return model
+
+    robot = type("Whole", (Spike,), {"name": "whole", "design_space": space, "assemble": assemble})()
+    if unused:
+        with pytest.warns(UserWarning, match="never reads the design variable widht: it"):
             robot.build()
     else:
         robot.build()
+
+
+@pytest.mark.parametrize(
+    ("attributes", "meant"),
+    [
+        ({"stiffness_variable": "young_modulus"}, "learning = Learning(stiffness_variable=...)"),
+        ({"sensor_scale": np.ones(1)}, "sensing = Sensing(scale=...)"),
+        ({"picture_axes": (0, 1, 2)}, "view = View(axes=...)"),
+        ({"goal_tolerence": 1e-3}, "goal_tolerance"),
+        ({"referense_path": lambda self: None}, "reference_path"),
+        ({"workspace_scales": 0.1, "sizes": (1, 2), "helper": 3}, "workspace_scale"),
+        ({"sizes": (1, 2), "_goal_tolerence": 1, "middle": 3}, None),
+    ],
+)
+def test_attributes_that_nothing_reads_are_named_once(attributes, meant):
+    cls = type("Old", (Spike,), {"name": "old", **attributes})
+    if meant is None:
+        cls()
+        return
+    with pytest.warns(UserWarning) as caught:
+        cls()
+    assert [str(each.message) for each in caught] == [
+        f"robot 'old': nothing reads its attribute '{next(iter(attributes))}'; did you mean '{meant}'?"
+    ]
+    cls()  # told once
