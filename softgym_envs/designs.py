@@ -14,14 +14,17 @@ from types import MappingProxyType
 
 import numpy as np
 
+from softgym_envs.arguments import explained
 from softgym_envs.errors import DesignError, unknown_name
 from softgym_envs.quantities import check_by_unit, check_unit
+from softgym_envs.wording import brief
 
 
 def _is_number(value: object) -> bool:
     return isinstance(value, numbers.Real) and not isinstance(value, bool)
 
 
+@explained
 @dataclass(frozen=True)
 class DesignVariable:
     """One scalar of a design.
@@ -51,7 +54,7 @@ class DesignVariable:
     def __post_init__(self) -> None:
         for label in ("low", "high", "baseline"):
             if not _is_number(value := getattr(self, label)):
-                raise DesignError(f"design variable '{self.name}': {label} = {value!r} must be a number")
+                raise DesignError(f"design variable '{self.name}': {label} = {brief(value)} must be a number")
         if not (math.isfinite(self.low) and math.isfinite(self.high)):
             raise DesignError(f"design variable '{self.name}': low {self.low} and high {self.high} must be finite")
         try:
@@ -87,7 +90,7 @@ class DesignVariable:
                 raise TypeError
             number = float(value)  # type: ignore[arg-type]
         except (TypeError, ValueError, OverflowError):
-            raise DesignError(f"design variable '{self.name}' = {value!r} is not a number; {allowed}") from None
+            raise DesignError(f"design variable '{self.name}' = {brief(value)} is not a number; {allowed}") from None
         if not math.isfinite(number):
             raise DesignError(f"design variable '{self.name}' = {number} is not finite; {allowed}")
         # Tolerate only the rounding of a bound to text or float32.
@@ -174,6 +177,7 @@ class Design(Mapping[str, float]):
         return f"Design({', '.join(f'{name}={value:g}' for name, value in self._values.items())})"
 
 
+@explained
 class DesignSpace:
     """An ordered set of design variables; iteration yields them in order."""
 
@@ -225,7 +229,7 @@ class DesignSpace:
         if design is None:
             return start
         if not isinstance(design, Mapping):
-            raise DesignError(f"a design is a mapping {{name: value}}, got {type(design).__name__}: {design!r}")
+            raise DesignError(f"a design is a mapping {{name: value}}, got {type(design).__name__}: {brief(design)}")
         for name in design:
             self[name]  # raises for an unknown name
         return Design(self, {**start, **design})

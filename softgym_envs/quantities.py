@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from softgym_envs.errors import unknown_name
+from softgym_envs.wording import brief
 
 UNCHECKED = "SOFTGYM_UNCHECKED"
 """Environment variable: names of quantities whose ranges are not checked, separated by commas."""
@@ -72,6 +73,7 @@ QUANTITIES: Mapping[str, Quantity] = {
     "force": Quantity("N", 0.0, 1e5, "up to 100 kN", {"mN": 1e-3, "kN": 1e3}, signed=True),
     "contact_distance": Quantity("m", 0.0, 0.1, "thinner than walls", _LENGTHS),
     "contact_stiffness": Quantity("Pa", 0.0, 1e13, "near a modulus", _PRESSURES),
+    "compliance": Quantity("m/N", 0.0, 0.1, "cables that stretch by up to 0.1 m per newton", {"mm/N": 1e-3}),
     "damping_rate": Quantity("1/s", 0.0, 1e5, "up to 1e5 per second"),
 }
 """All quantities by name."""
@@ -203,7 +205,7 @@ def numbers(value: object, label: str, unit: str = "1") -> np.ndarray:
     except ValueError:  # rows of different lengths
         array = np.array(["?"])
     if array.dtype.kind not in "biuf":
-        raise ValueError(f"{label} = {value!r} must be a number{'' if unit == '1' else f' [{unit}]'}")
+        raise ValueError(f"{label} = {brief(value)} must be a number{'' if unit == '1' else f' [{unit}]'}")
     return array.astype(float)
 
 
@@ -215,7 +217,7 @@ def finite_number(value: object, label: str, unit: str = "1") -> float:
     """
     array = numbers(value, label, unit)
     if np.ndim(value) or not np.isfinite(array).all():  # type: ignore[arg-type]
-        raise ValueError(f"{label} = {value!r} must be one finite number{'' if unit == '1' else f' [{unit}]'}")
+        raise ValueError(f"{label} = {brief(value)} must be one finite number{'' if unit == '1' else f' [{unit}]'}")
     return float(array[0])
 
 
@@ -226,7 +228,7 @@ def check_unit(unit: object, label: str) -> None:
         ValueError: with the SI unit and the factor to it where they are known.
     """
     if not isinstance(unit, str) or not unit:
-        raise ValueError(f"{label}: unit = {unit!r} must be the name of an SI unit, or '1' for a pure number")
+        raise ValueError(f"{label}: unit = {brief(unit)} must be the name of an SI unit, or '1' for a pure number")
     for part in re.split(r"[ /*·^()]+|(?<=[A-Za-z])-?\d+", unit):
         if part in ("", "1", "-") or part in _SI or part.isdigit():
             continue

@@ -6,19 +6,19 @@ The suite's own extensions (`softgym_envs.extensions`) are found through the sam
 from __future__ import annotations
 
 import inspect
-import numbers
 import os
 import re
 import types
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from functools import cache, partial
 from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, get_type_hints
 
+from softgym_envs.arguments import described, is_a
 from softgym_envs.errors import unknown_name
-from softgym_envs.wording import counted
+from softgym_envs.wording import brief
 
 
 class Table(Mapping[str, Any]):
@@ -172,7 +172,7 @@ class Registry(Table):
             if not isinstance(made, self._base_class()):
                 raise ValueError(
                     f"a {self.kind} must be a registered name, 'module:class', a subclass of "
-                    f"{self._base.replace(':', '.')} or an object of one, got {made!r}"
+                    f"{self._base.replace(':', '.')} or an object of one, got {brief(made)}"
                 )
             if options:
                 raise ValueError(
@@ -308,8 +308,8 @@ def check_options(owner: str, cls: type, positional: int, options: Mapping[str, 
         if name not in allowed:
             raise ValueError(f"{owner}: {unknown_name('option', name, allowed)}")
         _, annotation = allowed[name]
-        if not _is_a(value, annotation):
-            raise ValueError(f"{owner}: option {name} = {value!r} must be {_described(annotation)}")
+        if not is_a(value, annotation):
+            raise ValueError(f"{owner}: option {name} = {brief(value)} must be {described(annotation)}")
     missing = [name for name, (p, _) in allowed.items() if p.default is p.empty and name not in options]
     if missing:
         raise ValueError(f"{owner} needs the option {' and '.join(missing)}")
@@ -343,37 +343,3 @@ def _path(entry: Any) -> str:
         return entry
     owner = entry if hasattr(entry, "__qualname__") else type(entry)
     return f"{owner.__module__}:{owner.__qualname__}"
-
-
-def _is_a(value: object, annotation: Any) -> bool:
-    """Whether a value matches an annotated type; annotations that are not plain types accept everything."""
-    origin, arguments = get_origin(annotation), get_args(annotation)
-    if origin in (Union, types.UnionType):
-        return any(_is_a(value, each) for each in arguments)
-    if annotation is None or annotation is type(None):
-        return value is None
-    if annotation is float:
-        return isinstance(value, numbers.Real) and not isinstance(value, bool)
-    if annotation is int:
-        return isinstance(value, numbers.Integral) and not isinstance(value, bool)
-    if annotation in (bool, str):
-        return isinstance(value, annotation)
-    if origin is tuple and Ellipsis not in arguments:
-        # Lists are accepted: configuration files have no tuples.
-        return (
-            isinstance(value, Sequence)
-            and not isinstance(value, str)
-            and len(value) == len(arguments)
-            and all(map(_is_a, value, arguments))
-        )
-    return True
-
-
-def _described(annotation: Any) -> str:
-    origin, arguments = get_origin(annotation), get_args(annotation)
-    if origin in (Union, types.UnionType):
-        return " or ".join(map(_described, arguments))
-    if origin is tuple and set(arguments) <= {int, float}:
-        return counted(len(arguments), "number")
-    words = {float: "a number", int: "an integer", bool: "true or false", str: "a string", type(None): "none"}
-    return words.get(annotation, str(annotation))

@@ -40,3 +40,9 @@ def counted(count: int, noun: str) -> str:
 def time_text(seconds: float) -> str:
     """Return a time: ``"2.4 s"``, or ``"10.1 min"`` from a minute on."""
     return f"{seconds:.1f} s" if seconds < 60.0 else f"{seconds / 60.0:.1f} min"
+
+
+def brief(value: object, most: int = 100) -> str:
+    """Return a value as people write it, in one line of at most ``most`` characters."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= most else f"{text[: most - 4]} ..."

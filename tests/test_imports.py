@@ -18,7 +18,8 @@ FOLDERS = ("softgym_envs", "agents", "codesign")
 # From the bottom to the top. A package imports from packages in lower layers and from itself.
 LAYERS = [
     {"softgym_envs.version", "softgym_envs.errors", "softgym_envs.wording"},
-    {"softgym_envs.extras", "softgym_envs.storage", "softgym_envs.units", "softgym_envs.quantities"},
+    {"softgym_envs.arguments", "softgym_envs.extras", "softgym_envs.storage", "softgym_envs.units"}
+    | {"softgym_envs.quantities"},
     {"softgym_envs._lazy"},
     {"softgym_envs.designs", "softgym_envs.registry", "softgym_envs.executors"},
     {"softgym_envs.config"},

@@ -14,6 +14,7 @@ from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.quantities import check_quantity
 from softgym_envs.robots.base import Robot
 from softgym_envs.robots.checks import plausible_force
+from softgym_envs.wording import brief
 
 if TYPE_CHECKING:
     from softgym_envs.mechanics.contact.contact import Contacts
@@ -253,7 +254,7 @@ def check_touch(robot: Robot, rest: State, load: object) -> PointForce | None:
     if load is None:
         return None
     if not isinstance(load, PointForce):
-        raise ValueError(f"touch = {load!r} must be a PointForce(point=..., force=...) or None")
+        raise ValueError(f"touch = {brief(load)} must be a PointForce(point=..., force=...) or None")
     check_force(robot, rest, load.force, "force of a touch")
     return load
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from softgym_envs.arguments import choice
 from softgym_envs.backends.backend import (
     Backend,
     Ground,
@@ -32,7 +33,7 @@ from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.quantities import check_quantity
 from softgym_envs.robots.base import TOUCH_RADIUS, Robot
 from softgym_envs.surrogate.domain import FOLDED, LOADED, SOFT, SPREAD
-from softgym_envs.wording import counted
+from softgym_envs.wording import brief, counted
 
 if TYPE_CHECKING:
     from softgym_envs.mechanics.contact.contact import Contact, ContactMemory
@@ -274,11 +275,12 @@ class FEMBackend(Backend):
             values = np.broadcast_to(np.asarray(compliance, dtype=float), (len(self.robot.actuators),)).copy()
         except ValueError:
             raise ValueError(
-                f"cable_compliance = {compliance!r} must be one number or one for each of "
+                f"cable_compliance = {brief(compliance)} must be one number or one for each of "
                 f"{counted(len(self.robot.actuators), 'actuator')} [m/N]"
             ) from None
         if not (np.isfinite(values) & (values >= 0.0)).all():
             raise ValueError(f"cable_compliance = {compliance!r} must be finite and not negative")
+        check_quantity("compliance", values, "cable_compliance")
         if values.any() and (self.moving or self.robot.touches):
             raise ValueError("cable_compliance is computed in statics without contact only; allowed here: 0")
         return values
@@ -337,8 +339,7 @@ class FEMBackend(Backend):
         return self.state
 
     def _checked(self, command: np.ndarray, mode: str) -> np.ndarray:
-        if mode not in ("displacement", "effort"):
-            raise ValueError(f"mode = {mode!r} is unknown; allowed: 'displacement', 'effort'")
+        choice("mode", mode, ("displacement", "effort"))
         return check_command(self.robot, command, mode)
 
     def probe(self, command: np.ndarray, mode: str = "displacement") -> State:
@@ -363,7 +364,7 @@ class FEMBackend(Backend):
         Raises:
             ValueError: for a state of another backend, which has no deformed nodes.
         """
-        if state.nodes is None:
+        if not isinstance(state, State) or state.nodes is None:
             raise ValueError("the state has no deformed nodes; finite elements can only restore their own states")
         effort = state.row_effort
         self._statics.restore(state.nodes, effort, memory=state.memory)

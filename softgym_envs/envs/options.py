@@ -23,6 +23,7 @@ from softgym_envs.envs.tasks.registry import make_task
 from softgym_envs.errors import DesignError, unknown_name
 from softgym_envs.robots.base import Robot
 from softgym_envs.robots.registry import make_robot
+from softgym_envs.wording import brief
 
 if TYPE_CHECKING:
     from softgym_envs.envs.registration import RobotSource, TaskSource
@@ -60,7 +61,7 @@ class EnvironmentOptions:
         for name in ("robot_options", "task_options", "backend_options", "plant"):
             value = getattr(self, name)
             if not (value is None or isinstance(value, Mapping)):
-                raise ValueError(f"{name} = {value!r} must be a mapping from names to values")
+                raise ValueError(f"{name} = {brief(value)} must be a mapping from names to values")
 
     @classmethod
     def check(cls, options: Mapping[str, Any], *, own: Sequence[str] = ()) -> EnvironmentOptions:
@@ -172,7 +173,7 @@ def set_up(robot: RobotSource | None, task: TaskSource, backend: str | None, opt
     if backend != defaults.get("backend"):  # of other backends, those that move bodies too do so
         usual = shared_options(usual)
     # Without motion, its options have no effect; some backends always move bodies, in steps of their own.
-    if not (backend_options.get("dynamics", True) and takes_option(backend, made, "dynamics")):
+    if backend_options.get("dynamics", True) is False or not takes_option(backend, made, "dynamics"):
         usual = {name: value for name, value in usual.items() if name not in shared_options(usual)}
     backend_options = {**usual, **backend_options}
     check_backend(backend, made, backend_options)
@@ -228,6 +229,8 @@ def design_names(space: DesignSpace, choice: bool | Sequence[str], option: str) 
     if isinstance(choice, str) or not isinstance(choice, Iterable):
         example = choice if isinstance(choice, str) else space.names[0]
         raise DesignError(f"{option} = {choice!r} must be True, False or a list of names, such as [{example!r}]")
+    if not all(isinstance(name, str) for name in choice):
+        raise DesignError(f"{option} = {brief(choice)} must be True, False or a list of names")
     names = tuple(space[name].name for name in choice)
     if len(set(names)) < len(names):
         raise DesignError(f"{option} = {list(names)} must differ from each other")
@@ -285,7 +288,7 @@ def check_reset_options(options: Mapping[str, Any] | None) -> tuple[Any, Any]:
         ValueError: for an unknown option, or anything but a mapping.
     """
     if options is not None and not isinstance(options, Mapping):
-        raise ValueError(f"options of reset = {options!r} must be a mapping of 'design' and 'goal', or None")
+        raise ValueError(f"options of reset = {brief(options)} must be a mapping of 'design' and 'goal', or None")
     options = options or {}
     for name in options:
         if name not in ("design", "goal"):

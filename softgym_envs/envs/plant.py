@@ -14,6 +14,7 @@ from softgym_envs.errors import unknown_name
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.quantities import QUANTITIES
 from softgym_envs.robots.base import Robot
+from softgym_envs.wording import brief
 
 
 @dataclass(frozen=True)
@@ -214,7 +215,7 @@ def _ends(name: str, given: object) -> tuple[float, float]:
         valid = False
     if not valid or any(end != typed(end) for end in ends):
         word = "integers" if typed is int else "numbers"
-        raise ValueError(f"plant {name} = {given!r}; allowed: one or two {word} from {least} to {most}, rising")
+        raise ValueError(f"plant {name} = {brief(given)}; allowed: one or two {word} from {least} to {most}, rising")
     return typed(ends[0]), typed(ends[-1])
 
 

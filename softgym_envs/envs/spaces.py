@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from gymnasium import spaces
 
+from softgym_envs.arguments import choice
 from softgym_envs.envs.arrays import Array, namespace
 from softgym_envs.robots.base import Robot
 
@@ -48,8 +49,7 @@ class AgentSpaces:
         error_scale: float | None = None,
         sensors: int = 0,
     ) -> None:
-        if action_mode not in ("increment", "absolute"):
-            raise ValueError(f"action_mode = {action_mode!r} is unknown; allowed: 'increment', 'absolute'")
+        choice("action_mode", action_mode, ("increment", "absolute"))
         self.robot = robot
         self.action_mode = action_mode
         self.design_names = design_names

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from softgym_envs.arguments import explained
 from softgym_envs.mechanics.elements.block import ElementBlock
 from softgym_envs.mechanics.frames import frame_rows
 from softgym_envs.mechanics.mesh_checks import check_apart
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from softgym_envs.mechanics.elements.beams import Section
 
 
+@explained
 class ModelBuilder:
     """Collects parts and builds a `MechanicalModel` from them. Adding a part returns its first row.
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from softgym_envs.arguments import explained
 from softgym_envs.errors import DataError, unknown_name
 from softgym_envs.mechanics.cells import cell_shape, tetrahedra_of, triangles_of
 from softgym_envs.mechanics.elements.tetrahedra import boundary_triangles, orient_corners
@@ -74,6 +75,7 @@ def unit_factor(scale: float | None, unit: str | None) -> float:
     return UNITS[unit] if unit is not None else scale if scale is not None else 1.0
 
 
+@explained
 def read_mesh(
     path: str | Path,
     *,
@@ -160,6 +162,7 @@ def read_mesh(
     )
 
 
+@explained
 def read_surface(path: str | Path, *, time_limit: float = 60.0) -> tuple[np.ndarray, np.ndarray, bool]:
     """Read the surface in a file, or that of the solid cells in it.
 

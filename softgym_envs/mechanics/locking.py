@@ -103,7 +103,7 @@ def _compliances(model: Body) -> np.ndarray:
     return out
 
 
-def warn_of_locking(model: Body, *, stacklevel: int = 3) -> None:
+def warn_of_locking(model: Body, *, stacklevel: int = 4) -> None:
     """Warn if elements that were asked for miss much of a body's compliance; see `missing_compliance`."""
     if _accepted.get():
         return

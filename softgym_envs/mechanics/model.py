@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from softgym_envs.arguments import explained
 from softgym_envs.mechanics.assembly import Assembly
 from softgym_envs.mechanics.compilation import announce_compilation
 from softgym_envs.mechanics.constraints.cable import Cable
@@ -51,6 +53,7 @@ if TYPE_CHECKING:
 announce_compilation()
 
 
+@explained
 class MechanicalModel:
     """Soft bodies, beams and rigid parts with actuators, effectors, contact points, sensors and bonds.
 
@@ -526,12 +529,9 @@ class MechanicalModel:
     @property
     def rows(self) -> list[tuple[Constraint, slice]]:
         """All constraints with their rows in the condensed model."""
-        result, start = [], 0
-        for group in self.constraints.values():
-            for constraint in group:
-                result.append((constraint, slice(start, start + constraint.size)))
-                start += constraint.size
-        return result
+        everyone = [constraint for group in self.constraints.values() for constraint in group]
+        ends = np.cumsum([0, *(constraint.size for constraint in everyone)]).tolist()
+        return [(each, slice(*pair)) for each, pair in zip(everyone, pairwise(ends), strict=True)]
 
     # -- equations --------------------------------------------------------------------------------------------------
 

@@ -8,15 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from softgym_envs.arguments import explained
 from softgym_envs.mechanics.constraints.cable import Cable
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.elements.beams import Beam, Section, lagrange
-from softgym_envs.quantities import numbers
+from softgym_envs.quantities import check_quantity, numbers
+from softgym_envs.wording import brief
 
 ENDS = {"none": (), "start": (0,), "both": (0, -1)}
 """Which frames of a rod are clamped, by name."""
 
 
+@explained
 @dataclass(frozen=True)
 class Rod:
     """A chain of beam elements whose frames are known by their place along it.
@@ -95,6 +98,11 @@ class Rod:
         Raises:
             ValueError: for a disc that is not on the rod.
         """
+        if not np.size(places):
+            raise ValueError(f"tendon '{name}' needs one disc or more, got places = {brief(places)}")
+        check_quantity("compliance", compliance, f"tendon '{name}': compliance")
+        label, far = f"tendon '{name}': offsets", float(self.length)
+        check_quantity("length", offsets, label, high=far, example="the length of the rod")
         through = np.broadcast_to(np.asarray(offsets, dtype=float), (np.size(places), 2))
         if pull_point is None:
             pull_point = self.points(0.0, through[0], nodes).points[0]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import warnings
+from collections.abc import Hashable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -296,24 +297,46 @@ def _quadratic_inside_out(x, cells):
     return -1
 
 
+CHECKED = 16
+"""One of so many states is checked for outer walls that cross, besides those farther from rest than all before."""
+
+_TOLD: set[Hashable] = set()
+"""Bodies, by the names of their rows, of which a `CrossingWarning` told."""
+
+
+class CrossingWarning(UserWarning):
+    """Outer walls of a body passed through each other: a body that touches itself would be elsewhere."""
+
+
 class ShapeCheck:
     """Whether a state can be one: no wall of a cavity has passed through another, and no cell is inside out.
 
     The walls of a cavity may not cross each other, those of another cavity, or the outside of a solid; where a pressure
-    drives the body, its outer walls may not cross each other either. Elements whose Gauss points alone are kept from
-    turning inside out are checked at their corners.
+    drives the body, its outer walls may not cross each other either. Where nothing but cables and forces does, they
+    lead to a warning. Elements whose Gauss points alone are kept from turning inside out are checked at their corners.
 
     Args:
         cavities: whose walls do not touch anything in the model.
         outside: triangles of the boundary of solids (k, 3), which may contain those of the cavities.
         cells: nodes of such elements, shapes (m, 4) or, with midside nodes as in `QuadraticTetrahedra`, (m, 10).
         driven: whether the pressure of a cavity drives the body.
+        rest: rows at rest [m], shape (n, 3); without, there are no warnings.
+        name: of the body, whose warning comes once.
     """
 
     def __init__(
-        self, cavities: Iterable[Cavity], outside: np.ndarray, cells: Iterable[np.ndarray], *, driven: bool = False
+        self,
+        cavities: Iterable[Cavity],
+        outside: np.ndarray,
+        cells: Iterable[np.ndarray],
+        *,
+        driven: bool = False,
+        rest: np.ndarray | None = None,
+        name: Hashable = (),
     ) -> None:
         walls = [(each.name, each.flat_triangles) for each in cavities]
+        self._name, self._rest, self._farthest, self._since = name, rest, 0.0, 0
+        self._outside = np.empty((0, 3), dtype=np.int64) if driven or rest is None else np.ascontiguousarray(outside)
         self._names = [name for name, _ in walls]
         parts = [*(triangles for _, triangles in walls), *([outside] if walls else [])]
         owner = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
@@ -336,11 +359,38 @@ class ShapeCheck:
         cells = [
             block.connectivity[_no_slivers(model.nodes, block.corners)] for block in model.solids if block.points > 1
         ]
-        if touching or not cavities:
+        if touching or not model.solids:
             return cls([], np.empty((0, 3), dtype=np.int64), cells)
         driven = any(isinstance(each, Cavity) for each in model.constraints["a"])
         outside = np.concatenate([_boundary(block) for block in model.solids])
-        return cls(cavities.values(), outside, cells, driven=driven)
+        name = tuple(each.name for group in "aes" for each in model.constraints[group])
+        return cls(cavities.values(), outside, cells, driven=driven, rest=model.nodes, name=name)
+
+    def warn(self, x: np.ndarray) -> None:
+        """Warn once of outer walls that cross each other at the rows of a state [m], shape (n, 3).
+
+        States farther from rest than all before them are checked, and one of `CHECKED` others, which costs nothing.
+        """
+        if not len(self._outside) or self._name in _TOLD:
+            return
+        away, self._since = float(np.abs(x - self._rest).max()), self._since + 1
+        if away <= self._farthest and self._since < CHECKED:
+            return
+        self._farthest, self._since = max(away, self._farthest), 0
+        if (found := _crossing(x, self._outside, len(self._outside))) is None:
+            return
+        assert self._rest is not None
+        if _crossing(self._rest, self._outside, len(self._outside)) is not None:  # parts that overlap by construction
+            self._outside = self._outside[:0]
+            return
+        _TOLD.add(self._name)
+        warnings.warn(
+            f"outer walls of the body pass through each other near {np.round(found[2], 4).tolist()} m, because they do "
+            "not touch each other in this model; let them touch with self_contact=True of the robot, or "
+            "set_contact(settings=ContactSettings(self_contact=True))",
+            CrossingWarning,
+            stacklevel=4,
+        )
 
     def problem(self, x: np.ndarray) -> ImpossibleState | None:
         """Return what is wrong with the rows of a state [m], shape (n, 3): the wall or cell, and the place."""

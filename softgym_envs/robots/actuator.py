@@ -7,9 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from softgym_envs.arguments import explained
 from softgym_envs.quantities import check_by_unit, check_unit
+from softgym_envs.wording import brief
 
 
+@explained
 @dataclass(frozen=True)
 class Actuator:
     """One actuator of a robot.
@@ -41,7 +44,7 @@ class Actuator:
         for label in ("low", "high", "rate", "max_effort"):
             value = getattr(self, label)
             if not isinstance(value, numbers.Real) or isinstance(value, bool):
-                raise ValueError(f"actuator '{self.name}': {label} = {value!r} must be a number")
+                raise ValueError(f"actuator '{self.name}': {label} = {brief(value)} must be a number")
         check_unit(self.unit, f"actuator '{self.name}'")
         if not (np.isfinite([self.low, self.high]).all() and self.low < self.high):
             raise ValueError(f"actuator '{self.name}': low {self.low:g} must be below high {self.high:g}, both finite")

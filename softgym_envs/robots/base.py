@@ -7,7 +7,7 @@ import functools
 import inspect
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -27,6 +27,7 @@ from softgym_envs.robots.checks import (
     warn_unread,
 )
 from softgym_envs.robots.mesh_tiers import FOLLOWING, UNIFORM
+from softgym_envs.wording import brief
 
 if TYPE_CHECKING:
     from softgym_envs.mechanics.contact.obstacles import Obstacle
@@ -171,7 +172,7 @@ class Robot(ABC):
         if len(gravity) != 3 or not np.isfinite(gravity).all():
             raise ValueError(f"gravity must be three finite numbers [m/s2], got {gravity!r}")
         self.gravity = gravity
-        self.obstacles = self._checked_obstacles(obstacles) if obstacles else ()
+        self.obstacles = self._checked_obstacles(obstacles)
         self.self_contact = self_contact
         self.self_friction = self_friction
         self.contact_distance = contact_distance
@@ -305,10 +306,14 @@ class Robot(ABC):
         return self
 
     def _checked_obstacles(self, obstacles: Any) -> tuple[Any, ...]:
+        if isinstance(obstacles, tuple | list) and not obstacles:
+            return ()  # without loading contact
         from softgym_envs.mechanics.contact.obstacles import Obstacle, obstacle_from
 
         if isinstance(obstacles, Mapping | Obstacle):
-            raise ValueError(f"robot '{self.name}': obstacles must be a list, got one obstacle: {obstacles!r}")
+            raise ValueError(f"robot '{self.name}': obstacles must be a list, got one obstacle: {brief(obstacles)}")
+        if not isinstance(obstacles, Iterable) or isinstance(obstacles, str | bytes):
+            raise ValueError(f"robot '{self.name}': obstacles must be a list, got {brief(obstacles)}")
         return tuple(obstacle_from(obstacle) for obstacle in obstacles)
 
     def _add_contact(self, model: MechanicalModel, design: Mapping[str, float]) -> None:

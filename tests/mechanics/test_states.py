@@ -14,7 +14,7 @@ from softgym_envs.mechanics.contact.contact import ContactSettings
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.dynamics import Dynamics
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.mechanics.surfaces import ShapeCheck, self_intersection
+from softgym_envs.mechanics.surfaces import CrossingWarning, ShapeCheck, self_intersection
 from tests.helpers import box_mesh
 
 INSIDE = [0.03, 0.03, 0.00275]
@@ -96,6 +96,51 @@ def test_a_chamber_crosses_nothing_else(role, moved, walls):
     assert (found is None) == (walls is None)
     if walls:
         assert str(found).startswith(f"{walls} pass through each other near [")
+
+
+def two_bars(gap=0.002):
+    """Two bars of 60 x 5 x 10 mm side by side, clamped at one end; effectors at the other."""
+    builder = ModelBuilder()
+    nodes, tetrahedra = box_mesh((0.06, 0.005, 0.01), (8, 1, 2))
+    for y in (0.0, 0.005 + gap):
+        builder.add_solid(
+            nodes + [0.0, y, 1e-4 * (y > 0.0)],
+            tetrahedra,
+            fixed=nodes[:, 0] < 1e-9,
+            young_modulus=3e5,
+            element="averaged",
+            check=gap > 0.0,
+        )
+    model = builder.build()
+    for number, y in enumerate((0.0025, 0.0075 + gap)):
+        model.add_effector(f"tip_{number}_{gap}", [0.06, y, 0.0043], block=number)
+    return model
+
+
+def test_outer_walls_that_cross_without_pressure_are_told_once():
+    model, push = two_bars(), np.array([0.0, 0.02, 0.01, 0.0, -0.02, 0.0])
+    solver = Statics(model)
+    solver.solve([], effector_force=0.1 * push)
+    with pytest.warns(CrossingWarning, match=r"outer walls of the body pass through .* near .* m, .*self_contact=True"):
+        crossed = solver.solve([], effector_force=push)
+    assert crossed.stable
+    Statics(two_bars()).solve([], effector_force=push)  # the same body again
+    touching = two_bars(0.0021)
+    touching.set_contact(settings=ContactSettings(self_contact=True, distance=5e-4))
+    assert Statics(touching).solve([], effector_force=push).contacts.self_force > 0.0
+    Statics(two_bars(-0.001)).solve([], effector_force=push)  # bars that overlap on purpose
+
+
+def test_few_states_are_looked_at(monkeypatch):
+    """Those farther from rest than all before them, and one of sixteen others."""
+    model, looked = two_bars(0.0022), []
+    monkeypatch.setattr("softgym_envs.mechanics.surfaces._crossing", lambda *each: looked.append(each))
+    check = ShapeCheck.of(model)
+    for k in range(40):
+        x = model.nodes.copy()
+        x[-1] += 1e-3 if k == 3 else 0.5e-3
+        check.warn(x)
+    assert len(looked) == 4  # states 0, 3, 19 and 35
 
 
 def test_two_chambers_that_cross():

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse import coo_matrix, csc_matrix, csr_matrix, hstack
 
+from softgym_envs.arguments import explained
 from softgym_envs.mechanics.contact.obstacle_contact import ObstacleContact, Touch
 from softgym_envs.mechanics.contact.obstacles import MeshObstacle, Obstacle
 from softgym_envs.mechanics.contact.self_contact import SelfContact, SelfContactMemory
@@ -128,6 +129,7 @@ class ContactRow(NamedTuple):
     free: bool
 
 
+@explained
 @dataclass(frozen=True)
 class ContactSettings:
     """Which surfaces of a body touch, and the law of contact.

@@ -22,6 +22,7 @@ from typing import Unpack
 
 import numpy as np
 
+from softgym_envs.arguments import explained
 from softgym_envs.errors import ConvergenceError, ImpossibleState
 from softgym_envs.mechanics.assembly import Inertia, MassAndDamping
 from softgym_envs.mechanics.contact.contact import ContactMemory
@@ -62,6 +63,7 @@ class Motion:
         return self.kinetic + self.potential
 
 
+@explained
 class Dynamics(Statics):
     """Computes the motion of a model under changing commands.
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from softgym_envs.arguments import explained
 from softgym_envs.errors import ConvergenceError, no_equilibrium
 from softgym_envs.mechanics.condensation import ContactModel
 from softgym_envs.mechanics.model import MechanicalModel
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from softgym_envs.mechanics.solvers.cable_friction import CableMemory
 
 
+@explained
 class Statics(Newton):
     """Finds the equilibria of a model under changing commands, starting each solve from the last state.
 
@@ -65,6 +67,11 @@ class Statics(Newton):
         exact_compliance: bool = True,
         compiled: bool = True,
     ) -> None:
+        if not (np.isfinite(tolerance) and tolerance > 0.0):
+            raise ValueError(f"tolerance = {tolerance} m must be positive and finite")
+        if max_iterations < 1 or max_halvings < 0:
+            given = f"max_iterations = {max_iterations}, max_halvings = {max_halvings}"
+            raise ValueError(f"{given}; allowed: 1 iteration or more, and no negative number of halvings")
         super().__init__(model, tolerance=tolerance, max_iterations=max_iterations, exact_compliance=exact_compliance)
         self.max_halvings = max_halvings
         self._elasticity_version = model.elasticity_version
@@ -210,6 +217,7 @@ class Statics(Newton):
         if (impossible := self._shape.problem(self.x)) is not None:
             self.snapshot = before
             raise impossible
+        self._shape.warn(self.x)
         return found
 
     def contact_model(self, *, each_point: bool = False, friction: bool = False) -> ContactModel:
