@@ -130,6 +130,8 @@ def file_format(path: Path) -> str:
             return kind
     if _is_stl(path, head):
         return "stl"
+    if suffix == ".stl":
+        raise DataError(f"mesh file '{path}' {_broken_stl(path, head)}")
     if re.match(rb"\s*-1\r?\n\s*\d+\r?\n", head):
         return "unv"
     if len(head) > 73 and re.match(rb"[^\r\n]{72}S\s*\d+\s*[\r\n]", head):
@@ -152,6 +154,16 @@ def _is_stl(path: Path, head: bytes) -> bool:
     if len(head) >= 84 and path.stat().st_size == 84 + 50 * int.from_bytes(head[80:84], "little"):
         return True
     return head.lstrip().lower().startswith(b"solid") and b"facet" in head.lower()
+
+
+def _broken_stl(path: Path, head: bytes) -> str:
+    """Say why a file that is named .stl is none."""
+    if head.lstrip().lower().startswith(b"solid") and b"\0" not in head:
+        return "is an STL without triangles"
+    if len(head) < 84 or b"\0" not in head:
+        return f"is in no known format, though it is named .stl; known: {KNOWN}"
+    count, size = int.from_bytes(head[80:84], "little"), path.stat().st_size
+    return f"is no whole STL: it has {size} bytes, and the {count} triangles that it states take {84 + 50 * count}"
 
 
 def _xml_format(path: Path, low: bytes) -> str:

@@ -16,7 +16,7 @@ from softgym_envs.mechanics.assembly import Assembly
 from softgym_envs.mechanics.compilation import announce_compilation
 from softgym_envs.mechanics.constraints.cable import Cable
 from softgym_envs.mechanics.constraints.cavity import ATMOSPHERE, Cavity, SealedAir
-from softgym_envs.mechanics.constraints.constraint import Constraint
+from softgym_envs.mechanics.constraints.constraint import Constraint, add_constraint
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.elements.block import ElementBlock
@@ -287,9 +287,7 @@ class MechanicalModel:
 
     def add(self, role: str, constraint: Constraint) -> Constraint:
         """Add a constraint under a role letter: a actuator, e effector, c contact, s sensor, b bond."""
-        if role not in self.constraints:
-            raise ValueError(f"unknown role '{role}'; allowed: {', '.join(self.constraints)}")
-        self.constraints[role].append(constraint)
+        add_constraint(self.constraints, role, constraint)
         self._assembly = self._warping = None
         return constraint
 

@@ -1,18 +1,20 @@
-"""Rod of three segments with nine tendons (OpenCR, robot v6).
+"""Rod of three segments with nine tendons (OpenCR, robots v6 and v4).
 
 Dimensions, material and routing are those of the authors' configuration and data: github.com/ContinuumRoboticsLab/
-opencr-mujoco (MIT), configs/generation/ftdcr_v6_sysid.json and data/sysid/ftdcr_v6. The base is at the origin, the rod
-stands along z, and the tip is a marker beyond its end. The mass in their configuration carries the simulation, so it is
-left out with gravity, as there.
+opencr-mujoco (MIT), configs/generation/ftdcr_v6_sysid.json and data/sysid/ftdcr_v6, and v4 likewise. The base is at the
+origin, the rod stands along z, and the tip is a marker beyond its end. The mass in their configuration carries the
+simulation, so it is left out with gravity, as there.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from softgym_envs.arguments import choice
 from softgym_envs.designs import DesignSpace, DesignVariable
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.elements.beams import Section
@@ -20,8 +22,27 @@ from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.actuator import Actuator
 from softgym_envs.robots.base import Robot
 
-LENGTHS, DISCS = (0.100, 0.100, 0.022), (15, 15, 8)
-"""Length of each segment [m], and how many discs guide its tendons."""
+
+@dataclass(frozen=True)
+class Version:
+    """What the two robots differ in.
+
+    Attributes:
+        lengths: of the segments [m].
+        discs: how many guide the tendons of each.
+        young_modulus: of the rod [Pa].
+    """
+
+    lengths: tuple[float, float, float]
+    discs: tuple[int, int, int]
+    young_modulus: float
+
+
+VERSIONS = {
+    "v6": Version((0.100, 0.100, 0.022), (15, 15, 8), 1e10),
+    "v4": Version((0.060, 0.0625, 0.064), (10, 10, 10), 5e10),
+}
+"""The robots by their names there."""
 RADIUS = 0.0005
 """Of the rod [m]."""
 OFFSET = 0.0045
@@ -30,26 +51,32 @@ ANGLES = ((0.0, 120.0, 240.0), (30.0, 150.0, 270.0), (60.0, 180.0, 300.0))
 """Where the tendons of each segment are about the axis [degrees], from x towards y."""
 MARKER = 0.008
 """Distance of the marker from the end of the rod [m]."""
-PULL = 0.012
-"""Longest pull or slack of a tendon [m]; the recordings have 10 mm of both."""
+PULL = 0.013
+"""Longest pull or slack of a tendon [m]; the recordings have up to 12.4 mm."""
 
 
 class TendonRod(Robot):
     """Slender rod whose segments bend in any direction.
 
     Args:
+        version: which of the robots, see `VERSIONS`.
         gravity: acceleration [m/s2].
         **options: options of `Robot`.
     """
 
     name = "tendon_rod"
     effectors = ("tip",)
-    size = sum(LENGTHS) + MARKER
 
-    def __init__(self, *, gravity: tuple[float, float, float] = (0.0, 0.0, 0.0), **options: Any) -> None:
+    def __init__(
+        self, *, version: str = "v6", gravity: tuple[float, float, float] = (0.0, 0.0, 0.0), **options: Any
+    ) -> None:
         super().__init__(gravity=gravity, **options)
+        self._version = VERSIONS[choice("version", version, VERSIONS)]
+        self.size = sum(self._version.lengths) + MARKER
         self.design_space = DesignSpace(
-            DesignVariable("young_modulus", 1e9, 1e11, 1e10, "Pa", "stiffness of the rod", log=True),
+            DesignVariable(
+                "young_modulus", 1e9, 1e11, self._version.young_modulus, "Pa", "stiffness of the rod", log=True
+            ),
             DesignVariable("offset", 0.0035, 0.0055, OFFSET, "m", "distance of the tendons from the axis"),
             DesignVariable("twist", -0.5, 0.5, 0.0, "rad", "turn of each segment's tendons beyond those before it"),
         )
@@ -61,8 +88,11 @@ class TendonRod(Robot):
 
     def assemble(self, design: Mapping[str, float]) -> MechanicalModel:
         """Stand the rod up, thread each tendon through the discs up to the end of its segment."""
-        starts = np.cumsum([0.0, *LENGTHS])
-        discs = [s + length * np.arange(1, n + 1) / n for s, length, n in zip(starts[:-1], LENGTHS, DISCS, strict=True)]
+        lengths, counts = self._version.lengths, self._version.discs
+        starts = np.cumsum([0.0, *lengths])
+        discs = [
+            s + length * np.arange(1, n + 1) / n for s, length, n in zip(starts[:-1], lengths, counts, strict=True)
+        ]
         frames = np.concatenate([[0.0], *discs])
         builder = ModelBuilder(gravity=self.gravity)
         builder.add_rod(

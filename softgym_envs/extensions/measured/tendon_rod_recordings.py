@@ -10,6 +10,7 @@ import numpy as np
 
 from softgym_envs.config import check_config
 from softgym_envs.envs.plant import play
+from softgym_envs.errors import DataError
 from softgym_envs.extensions.design.calibration import calibrate, fitted_units, predicted
 from softgym_envs.extensions.design.config import CalibrationConfig
 from softgym_envs.extensions.design.fit_page import Page, Picture, Table, drawn, parameter_table, residual_picture
@@ -17,9 +18,10 @@ from softgym_envs.extensions.design.measurements import Measurements
 from softgym_envs.extensions.design.plots import BASELINE, WINNER
 from softgym_envs.extensions.measured.comparison import SOURCES, Comparison, Line, files_in, left_out
 from softgym_envs.extensions.measured.recordings import read_table
+from softgym_envs.extensions.measured.tendon_rod import VERSIONS
 
-SERVOS = (1, 20, 23, 9, 6, 11, 24, 2, 3)
-"""Servos in the order of the tendons of the robot."""
+SERVOS = {"v6": (1, 20, 23, 9, 6, 11, 24, 2, 3), "v4": (4, 3, 9, 5, 2, 8, 6, 1, 7)}
+"""Servos of each robot in the order of its tendons."""
 TENDONS = tuple(f"tendon_{segment}{place}" for segment in (1, 2, 3) for place in (1, 2, 3))
 SINGLE = "tendon"
 """Part of the label of poses in which one tendon is pulled while the others hang 10 mm slack."""
@@ -61,12 +63,29 @@ CONFIG: dict[str, Any] = {
 """What is fitted: twelve physical numbers, and where the origin of the cameras is."""
 
 
+def version_of(path: Path) -> str:
+    """Return which robot a file is of, by its servos.
+
+    Raises:
+        DataError: if it cannot be read, or has the servos of neither.
+    """
+    try:
+        with open(path, encoding="utf-8-sig") as stream:
+            names = stream.readline().strip().split(",")
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"recording '{path}' cannot be read: {error}") from None
+    for version, servos in SERVOS.items():
+        if all(f"servo_{number}_mm" in names for number in servos):
+            return version
+    raise DataError(f"recording '{path}' has no columns servo_N_mm of one of the robots {', '.join(SERVOS)}")
+
+
 def read(path: Path) -> Measurements:
     """Return the poses of a file; a trial is what its label names, with or without a hold at the end.
 
     Positions are in the frame of the robot: that of the cameras is turned by half a turn about the axis.
     """
-    servos = [f"servo_{number}_mm" for number in SERVOS]
+    servos = [f"servo_{number}_mm" for number in SERVOS[version_of(path)]]
     tip = ["tip_x", "tip_y", "tip_z"]
     table = read_table(path, [*servos, *tip], ["pattern_label"])
     pulls = 1e-3 * np.column_stack([table[name] for name in servos])
@@ -88,7 +107,8 @@ def compare(folder: Path) -> Comparison:
     Other files than ``*train.csv`` are held out. Without any, every second trial of the training poses is.
     """
     source = SOURCES["tendon_rod"]
-    everything = read(files_in(folder, "*train.csv", source)[0])
+    path = files_in(folder, "*train.csv", source)[0]
+    everything, version = read(path), version_of(path)
     single = np.array([SINGLE in name for name in everything.trial])
     train = everything.part(~single)
     files = [path for path in sorted(folder.glob("*val.csv"))]
@@ -100,7 +120,8 @@ def compare(folder: Path) -> Comparison:
         names = list(train.trials[1::2])
         held = train.split(names)[1]
         of = "every second trial"
-    config = check_config(CalibrationConfig, {**CONFIG, "held_out": names}, "the comparison")
+    given = {**CONFIG, "robot_options": {"version": version}}
+    config = check_config(CalibrationConfig, {**given, "held_out": names}, "the comparison")
     began = time.process_time()
     result = calibrate(config, data=train)
     seconds = time.process_time() - began
@@ -117,7 +138,7 @@ def compare(folder: Path) -> Comparison:
     error = {kind: found[kind][:, 9:] - part.effector for kind, part in parts.items()}
     count = len(config.fit) + len(config.nuisances) - 3
     nominal_config = check_config(
-        CalibrationConfig, {**CONFIG, "nuisances": {}, "fit": ["twist"], "level": None}, "the comparison"
+        CalibrationConfig, {**given, "nuisances": {}, "fit": ["twist"], "level": None}, "the comparison"
     )
     plain = Measurements("displacement", centred_pulls(held), held.effort, held.effector, held.trial)
     textbook = type(result)(**{**vars(result), "design": {**result.design, "twist": 0.0}, "nuisances": {}})
@@ -131,7 +152,7 @@ def compare(folder: Path) -> Comparison:
         Line("identification", f"{seconds:.0f} CPU s", ""),
         Line("speed", f"{pace:.1f} CPU s for 1,000 poses", ""),
     ]
-    lines += left_out(folder, [*files_in(folder, "*train.csv", source)[:1], *files[:1]])
+    lines += left_out(folder, [path, *files[:1]])
     still = np.abs(centred_pulls(train)).max(axis=1) < STILL
     explained = scatter_at_rest(train) if still.sum() > 3 * PARTS else {}
     rows = []
@@ -176,7 +197,7 @@ def compare(folder: Path) -> Comparison:
         axes[0].set_ylabel("z [mm]")
         axes[0].legend()
 
-    table = parameter_table(result, fitted_units(config))
+    table, modulus = parameter_table(result, fitted_units(config)), VERSIONS[version].young_modulus
     page = Page(
         "Tendon rod: measured and computed",
         [
@@ -184,7 +205,7 @@ def compare(folder: Path) -> Comparison:
             f"({there} there), offset aligned.",
             f"Recordings: {source.origin}, {source.folder}. Others: {source.others}.",
             "The tendons' stretch is known only in proportion to the rod's flexibility: recordings of positions "
-            "without a force cannot tell them apart. The modulus is the authors' 10 GPa.",
+            f"without a force cannot tell them apart. The modulus is the authors' {1e-9 * modulus:g} GPa.",
             rest,
             *result.notes,
         ],

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 
 import numpy as np
 
+from softgym_envs.errors import unknown_name
 from softgym_envs.mechanics.condensation import Row, point_rows
+from softgym_envs.wording import brief
 
 
 class Constraint(ABC):
@@ -65,3 +68,19 @@ class Constraint(ABC):
         Any shape of that size works, such as (k, k) for the default pattern; None if delta is linear.
         """
         return None
+
+
+def add_constraint(constraints: Mapping[str, list[Constraint]], role: str, constraint: Constraint) -> None:
+    """Add a constraint to those of its role.
+
+    Raises:
+        ValueError: for an unknown role, what is no constraint, or a name that another one of the role has.
+    """
+    if role not in constraints:
+        raise ValueError(unknown_name("role", role, constraints))
+    if not isinstance(constraint, Constraint):
+        raise ValueError(f"role '{role}' takes a constraint, got {brief(constraint)}")
+    if role in "aes" and any(each.name == constraint.name for each in constraints[role]):
+        word = {"a": "an actuator", "e": "an effector", "s": "a sensor"}[role]
+        raise ValueError(f"the model already has {word} named '{constraint.name}'; give each its own name")
+    constraints[role].append(constraint)

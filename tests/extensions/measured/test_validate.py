@@ -111,11 +111,11 @@ STRETCH, TWIST, TURN = 6e-4, 0.12, -0.1
 ZEROS = 1e-3 * np.array([0.4, -0.3, 0.2, 0.5, 0.3, 0.0, 0.6, 0.1, 0.2])
 
 
-def rod_poses(path, trials, rng, noise):
+def rod_poses(path, trials, rng, noise, version="v6"):
     """Write poses of a rod whose tendons stretch and whose servos have offsets, seen in a turned frame."""
-    robot = make_robot("tendon_rod")
+    robot = make_robot("tendon_rod", version=version)
     backend = FEMBackend(robot, {"twist": TWIST}, cable_compliance=STRETCH)
-    header = ["timestamp", "pattern_label", *(f"servo_{n}_mm" for n in tendon_rod_recordings.SERVOS)]
+    header = ["timestamp", "pattern_label", *(f"servo_{n}_mm" for n in tendon_rod_recordings.SERVOS[version])]
     c, s = np.cos(TURN), np.sin(TURN)
     rows = []
     for k, fractions in enumerate(rng.uniform(0.0, 1.0, (6 * trials, 9))):
@@ -128,12 +128,12 @@ def rod_poses(path, trials, rng, noise):
         csv.writer(stream).writerows([[*header, "tip_x", "tip_y", "tip_z"], *rows])
 
 
-@pytest.mark.parametrize("held_out_file", [False, True])
-def test_a_rod_of_known_tendons(tmp_path, held_out_file):
+@pytest.mark.parametrize(("version", "held_out_file"), [("v6", False), ("v4", True)])
+def test_a_rod_of_known_tendons(tmp_path, version, held_out_file):
     rng = np.random.default_rng(7)
-    rod_poses(tmp_path / "made_train.csv", 12, rng, 3e-4)
+    rod_poses(tmp_path / "made_train.csv", 12, rng, 3e-4, version)
     if held_out_file:
-        rod_poses(tmp_path / "made_val.csv", 3, rng, 3e-4)
+        rod_poses(tmp_path / "made_val.csv", 3, rng, 3e-4, version)
     found = tendon_rod_recordings.compare(tmp_path)
     assert float(found.lines[0].ours.split()[0]) < 1.0
     values = {text.split()[0]: [float(v) for v in text.replace(" to ", " ").split()[1:4]] for text in found.fitted}
@@ -149,6 +149,16 @@ def test_a_rod_of_known_tendons(tmp_path, held_out_file):
     assert outside <= 2
     if held_out_file:
         assert "made_val.csv" in found.lines[0].what
+
+
+def test_recordings_of_another_rod(refused, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("data")
+    (folder / "x_train.csv").write_text("timestamp,pattern_label,servo_1_mm,tip_x\n0,a,0,0\n")
+    assert "has no columns servo_N_mm of one of the robots v6, v4" in refused(
+        "validate", "tendon_rod", "--data", folder
+    )
+    with pytest.raises(ValueError, match="unknown version 'v5'; .*allowed: v6, v4"):
+        make_robot("tendon_rod", version="v5")
 
 
 @pytest.mark.parametrize("width", [0.0, 2e-3])
