@@ -220,8 +220,8 @@ def _element_values(
                 raise ValueError(f"{name}: {unknown_name('region', region, regions)}")
             if (twice := np.isfinite(out[regions[region]]) & (out[regions[region]] != value)).any():
                 raise ValueError(
-                    f"{name}: {np.count_nonzero(twice)} of {count} elements of region '{region}' have another value from "
-                    "a region before it; regions with different values must not overlap"
+                    f"{name}: {np.count_nonzero(twice)} of {count} elements are in region '{region}' and in one with "
+                    "another value; regions with different values must not overlap"
                 )
             out[regions[region]] = value
         missing = np.flatnonzero(np.isnan(out))

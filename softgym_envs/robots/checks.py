@@ -78,10 +78,14 @@ _REQUIRED = ("name", "effectors", "size", "design_space", "actuators", "effector
 _WRITTEN_OTHERWISE = {
     **{name: f"learning = Learning({name}=...)" for name in ("stiffness_variable", "convex", "symmetries")},
     "learned_parts": "learning = Learning(parts=...)",
+    "weights_name": "learning = Learning(weights=...)",
+    "load_variables": "learning = Learning(loads=...)",
+    **{name: "learning = Learning(touch=...)" for name in ("touch_variant", "touch_design")},
     "sealed": "sensing = Sensing(sealed=...)",
     "sensor_scale": "sensing = Sensing(scale=...)",
     "sensor_unit": "sensing = Sensing(unit=...)",
     "picture_axes": "view = View(axes=...)",
+    "free_object": "view = View(at_rest=...)",
 }
 """How the attributes of a robot are written that stand in one of its objects, or have another name."""
 

@@ -181,3 +181,33 @@ def test_names_do_not_matter(tmp_path):
     for suffix in (".stl", ".obj", ".msh", ".dat", ".txt"):
         path = renamed(saved(tetrahedra, "bar.vtu"), f"named{suffix}")(tmp_path)
         assert len(read_mesh(path, unit="mm").tetrahedra) == 18
+
+
+def test_regions_with_different_values_do_not_overlap(tmp_path):
+    mesh = tetrahedra()
+    mesh.cell_sets = {"soft": [np.arange(9)], "stiff": [np.arange(6, 18)]}
+    mesh.write(tmp_path / "bar.inp")
+    options = {"unit": "mm", "fixed": lambda x: x[:, 0] < 1e-9}
+    with pytest.raises(
+        ValueError, match="young_modulus: 3 of 18 elements are in region 'stiff' and in one with another"
+    ):
+        MechanicalModel.from_file(tmp_path / "bar.inp", young_modulus={"soft": 1e5, "stiff": 1e6}, **options)
+    MechanicalModel.from_file(tmp_path / "bar.inp", young_modulus={"soft": 1e5, "stiff": 1e5}, **options)
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (
+            BY_NAME["STL, binary"].make,
+            "is no whole STL: it has 664 bytes, and the 12 triangles that it states take 684",
+        ),
+        (content("bar.STL", "solid x\nendsolid x\n"), "is an STL without triangles"),
+    ],
+)
+def test_an_stl_that_is_not_whole(tmp_path, data, message):
+    path = data(tmp_path)
+    if path.stat().st_size > 600:
+        path.write_bytes(path.read_bytes()[:-20])
+    with pytest.raises(DataError, match=message):
+        read_mesh(path)

@@ -287,6 +287,15 @@ def test_malformed_fixed_nodes_are_rejected(fixed):
 def test_unknown_role_is_rejected(beam):
     with pytest.raises(ValueError, match="unknown role 'x'"):
         beam.add("x", beam.constraints["a"][0])
+    with pytest.raises(ValueError, match="role 'a' takes a constraint, got 'cable'"):
+        beam.add("a", "cable")
+
+
+def test_rows_of_a_role_have_different_names(beam):
+    actuator = beam.constraints["a"][0]
+    with pytest.raises(ValueError, match=f"the model already has an actuator named '{actuator.name}'; give each its own"):
+        beam.add("a", actuator)
+    beam.add("s", actuator)  # measured too
 
 
 @pytest.mark.parametrize(
