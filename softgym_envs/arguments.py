@@ -28,10 +28,8 @@ _KNOWN = frozenset({"softgym_envs", "numpy", "scipy", "pathlib", "meshio"})
 
 _OWN = ("self", "cls")
 
-PLAIN = {
-    **{kind: kind for kind in (str, bool, int, float)},
-    **{kind.__name__: kind for kind in (str, bool, int, float)},
-}
+_KINDS: tuple[type, ...] = (str, bool, int, float)
+PLAIN: dict[Any, type] = {**{kind: kind for kind in _KINDS}, **{kind.__name__: kind for kind in _KINDS}}
 """Annotations that are checked at each call, also as they stand in a source with postponed annotations."""
 
 
@@ -124,7 +122,7 @@ def _resolved(function: Callable[..., Any], name: str) -> Annotation:
         return Any
 
 
-def is_a(value: object, annotation: Annotation) -> bool:
+def is_a(value: Any, annotation: Annotation) -> bool:
     """Whether a value matches an annotated type; annotations that say nothing about kinds accept everything."""
     origin, arguments = get_origin(annotation), get_args(annotation)
     if annotation is ArrayLike or annotation is np.ndarray or origin is np.ndarray:
@@ -191,7 +189,7 @@ def described(annotation: Annotation) -> str:
     if origin is Callable or annotation is Callable:
         return "a function"
     words = {float: "a number", int: "an integer", bool: "true or false", str: "a string", type(None): "none"}
-    return words.get(annotation) or getattr(annotation, "__name__", str(annotation))
+    return str(words.get(annotation) or getattr(annotation, "__name__", annotation))
 
 
 def choice(kind: str, value: object, allowed: Iterable[str]) -> str:

@@ -293,7 +293,9 @@ def test_unknown_role_is_rejected(beam):
 
 def test_rows_of_a_role_have_different_names(beam):
     actuator = beam.constraints["a"][0]
-    with pytest.raises(ValueError, match=f"the model already has an actuator named '{actuator.name}'; give each its own"):
+    with pytest.raises(
+        ValueError, match=f"the model already has an actuator named '{actuator.name}'; give each its own"
+    ):
         beam.add("a", actuator)
     beam.add("s", actuator)  # measured too
 
