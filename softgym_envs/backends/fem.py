@@ -42,20 +42,26 @@ if TYPE_CHECKING:
     from softgym_envs.mechanics.solvers.rollout import Rollout
 
 
+SHIFT = 1e-3
+"""Motion by which it is found out whether something holds a body, in its sizes or as an angle [rad]."""
+
+
 def _drifts(model: MechanicalModel) -> bool:
-    """Whether nothing holds a body: moved anywhere, it stores no energy, and neither actuators nor bonds notice."""
-    moved = np.ones(len(model.nodes), bool)
-    moved[(model.frames.rows[:, None] + np.arange(1, 4)).ravel()] = False  # directors
-    moved[model.frames.carried[model.frames.moves != 1.0]] = False
+    """Whether nothing holds a body: shifted or turned, it stores no energy, and neither actuators nor bonds notice."""
+    from scipy.spatial.transform import Rotation
+
+    places = np.ones((len(model.nodes), 1))
+    places[(model.frames.rows[:, None] + np.arange(1, 4)).ravel()] = 0.0  # directors turn but do not shift
+    places[model.frames.carried[model.frames.moves != 1.0]] = 0.0
     held = [constraint for group in "ab" for constraint in model.constraints[group]]
     size = float(np.ptp(model.nodes, axis=0).max()) or 1.0
-    for axis in np.eye(3):
-        x = model.nodes + 1e-3 * size * axis * moved[:, None]
-        if abs(model.elastic_energy(x) - model.elastic_energy(model.nodes)) > 1e-12 or any(
-            np.abs(constraint.value(x) - constraint.value(model.nodes)).max() > 1e-6 * size for constraint in held
-        ):
-            return False
-    return True
+    shifted = [model.nodes + SHIFT * size * axis * places for axis in np.eye(3)]
+    turned = [model.nodes @ Rotation.from_rotvec(SHIFT * axis).as_matrix().T for axis in np.eye(3)]
+    return not any(
+        abs(model.elastic_energy(x) - model.elastic_energy(model.nodes)) > 1e-12
+        or any(np.abs(each.value(x) - each.value(model.nodes)).max() > 1e-6 * size for each in held)
+        for x in (*shifted, *turned)
+    )
 
 
 def _relax_dynamically(model: MechanicalModel, statics: Statics, command: np.ndarray) -> Equilibrium:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from softgym_envs import make_robot
-from softgym_envs.backends.fem import FEMBackend
+from softgym_envs.backends.fem import FEMBackend, _drifts
+from softgym_envs.mechanics.constraints.servo import Servo
 
 
 @pytest.fixture(scope="module")
@@ -58,3 +59,10 @@ def test_what_a_swimmer_cannot_be(robot):
         make_robot("swimmer", viscosity=0.0)
     with pytest.raises(ValueError, match="elements = 0 is out of bounds"):
         make_robot("swimmer", elements=0)
+
+
+def test_a_body_that_can_shift_but_not_turn_does_not_drift():
+    model = make_robot("swimmer").build()
+    assert _drifts(model)
+    model.add("a", Servo("heading", 0, np.array([0.0, 0.0, 1.0]), model.nodes))
+    assert not _drifts(model)
