@@ -59,7 +59,7 @@ def _explained(function: Callable[..., Any], owner: str) -> Callable[..., Any]:
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
-        for name, value in (*zip(names, args, strict=False), *kwargs.items()):
+        for name, value in (*zip(names, args, strict=False), *kwargs.items()) if simple else ():
             if name in simple and not is_a(value, simple[name]):
                 raise ValueError(f"{owner}: {name} = {brief(value)} must be {described(simple[name])}")
         try:
