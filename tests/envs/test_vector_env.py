@@ -151,9 +151,6 @@ def test_stable_baselines_adapter():
         assert info["terminal_observation"].shape == (15,)
         assert info["episode"]["l"] == 50
     assert all(not info["displacement"].any() for info in env.reset_infos)
-    sync = gymnasium.vector.SyncVectorEnv([lambda: gymnasium.make("SoftGym/FingerReach-v0")])
-    with pytest.raises(ValueError, match="autoreset"):
-        SB3VecEnv(sync)
 
 
 def test_options_of_stable_baselines_hold_one_episode():
