@@ -6,6 +6,8 @@ import math
 
 import numpy as np
 
+from softgym_envs import make_robot
+from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.chamber import Chamber
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
@@ -16,6 +18,7 @@ from softgym_envs.mechanics.elements.beams import Beam, Section
 from softgym_envs.mechanics.elements.rigid import box_inertia
 from softgym_envs.mechanics.skins import box_skin, tube_skin
 from softgym_envs.mechanics.solvers.dynamics import Dynamics
+from softgym_envs.mechanics.solvers.schemes import ImplicitEuler
 
 H = 0.01
 HALF = np.array([0.05, 0.03, 0.008])
@@ -69,3 +72,45 @@ def trot(time):
         swing, lift = math.sin(12.0 * time) * sign, 0.5 * (1.0 + math.cos(12.0 * time) * sign)
         volumes[2 * leg : 2 * leg + 2] = size * (lift + swing), size * (lift - swing)
     return volumes
+
+
+def random_walk(seed):
+    """A quadruped with a random body, and a random gait: its backend and the commands of 200 time steps (200, 8)."""
+    rng, robot = np.random.default_rng(seed), make_robot("quadruped")
+    space = robot.design_space
+    design = {name: float(space[name].from_unit(rng.uniform(-1.0, 1.0))) for name in space.names}
+    backend = FEMBackend(robot, design, dynamics=True)
+    size, phase, middle = rng.uniform(0.9e-8, 3e-8, 8), rng.uniform(0.0, 2.0 * np.pi, 8), rng.uniform(0.0, 2e-8, 8)
+    k = np.arange(1, 41)[:, None]
+    volumes = (middle + size * np.sin(2.0 * np.pi * k / 10 + phase)) * np.minimum(1.0, k / 5)
+    volumes = volumes.clip(robot.lower, robot.upper)
+    before = np.vstack([np.zeros(8), volumes[:-1]])
+    return backend, np.concatenate([backend.steps.ramp(a, b) for a, b in zip(before, volumes, strict=True)])
+
+
+def mover(backend, **options):
+    """Dynamics of the present body of a backend, at rest."""
+    solver, rest = Dynamics(backend.model, **{**backend.step_options, **options}), backend.rest
+    solver.restore(rest.nodes, rest.row_effort, memory=rest.memory)
+    return solver
+
+
+def remaining(general, start, x, effort, command):
+    """What the general solver would still correct at the end of a time step [m], and its ``W``.
+
+    Args:
+        general: a solver that is not compiled.
+        start: rows, efforts, velocities and memory at the start.
+        x: rows at the end, shape (n, 3).
+        effort: efforts there, shape (size,).
+        command: values of the actuators there, shape (n_a,).
+    """
+    rows, efforts, velocity, memory = start
+    general.restore(rows, efforts, velocity, memory=memory)
+    inertia, goal = ImplicitEuler(rows, velocity, general.step, general._body), np.zeros(len(effort))
+    goal[: len(command)] = command
+    general.x, general.effort = x, effort
+    with general._inertia_added(inertia):
+        assert general.linearisation.update(x, effort, exact=True)
+        step, _ = general._correction(None, general.linearisation.delta, effort, goal, np.arange(len(command)))
+        return general._norm(step), general.linearisation.W.copy()

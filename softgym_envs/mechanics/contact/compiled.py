@@ -178,6 +178,31 @@ def stretch_of(p, obstacle, edges, anchor, out):
 
 
 @njit(cache=True, error_model="numpy")
+def add_friction(p, obstacle, edges, anchor, spring, limit, out):
+    """Add the friction of a spring [N/m] whose limit [N] is held to pull and tangent; its energy [J] and if it slides.
+
+    Fills ``out.direction``, if it slides with the unit vector of the stretch.
+    """
+    along, place, size = out.direction, out.place, stretch_of(p, obstacle, edges, anchor, out)
+    sliding = spring * size > limit
+    factor = limit / size if sliding else spring
+    for i in range(3):
+        out.pull[i] += factor * along[i]
+    if sliding:
+        for i in range(3):
+            along[i] /= size
+    for i in range(3):
+        for j in range(3):
+            value = -place[i] * place[j]
+            if i == j:
+                value += 1.0
+            if sliding:
+                value -= along[i] * along[j]
+            out.tangent[i, j] += factor * value
+    return (limit * size - 0.5 * limit * limit / spring if sliding else 0.5 * spring * size * size), sliding
+
+
+@njit(cache=True, error_model="numpy")
 def touch_point(p, area, obstacle, edges, anchor, law, convex, out):
     """Fill what one obstacle does to a point that is nearer than the distance of contact, and outside.
 
@@ -195,7 +220,7 @@ def touch_point(p, area, obstacle, edges, anchor, law, convex, out):
         out: a `PointTouch`, is filled.
     """
     distance, stiffness, stick = law[0], law[1], law[2]
-    pull, tangent, normal, place = out.pull, out.tangent, out.normal, out.place
+    pull, tangent, normal = out.pull, out.tangent, out.normal
     gap, scale = gap_of(p, obstacle, edges, normal, out.curvature), stiffness * area
     first, second = scale * barrier_slope(gap, distance), scale * barrier_curvature(gap, distance)
     for i in range(3):
@@ -207,23 +232,7 @@ def touch_point(p, area, obstacle, edges, anchor, law, convex, out):
     energy = scale * barrier_value(gap, distance)
     if not obstacle[1] > 0.0:
         return energy, 0.0, gap, -first, False
-    along, size = out.direction, stretch_of(p, obstacle, edges, anchor, out)
-    spring, limit = stick * area, -obstacle[1] * first
-    sliding = spring * size > limit
-    factor = limit / size if sliding else spring
-    rub = limit * size - 0.5 * limit * limit / spring if sliding else 0.5 * spring * size * size
+    rub, sliding = add_friction(p, obstacle, edges, anchor, stick * area, -obstacle[1] * first, out)
     for i in range(3):
-        pull[i] += factor * along[i]
-    if sliding:
-        for i in range(3):
-            along[i] /= size
-            out.loading[i] = -obstacle[1] * second * normal[i]
-    for i in range(3):
-        for j in range(3):
-            value = -place[i] * place[j]
-            if i == j:
-                value += 1.0
-            if sliding:
-                value -= along[i] * along[j]
-            tangent[i, j] += factor * value
+        out.loading[i] = -obstacle[1] * second * normal[i]
     return energy, rub, gap, -first, sliding

@@ -11,6 +11,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numba import types
+from numba.extending import overload
 
 from softgym_envs.mechanics.compilation import FAST, njit
 from softgym_envs.mechanics.contact.compiled import quick_gap, stretch_of, touch_point
@@ -76,18 +78,24 @@ def _keep(all_anchors, s, anchors):
     all_anchors[s] = anchors
 
 
-@njit(cache=True, error_model="numpy")
 def _anchors_at(all_anchors, s):
     """Return the anchors at the start of a step."""
-    if all_anchors is None:
-        return None
-    return all_anchors[s]
+    return None if all_anchors is None else all_anchors[s]
+
+
+@overload(_anchors_at)
+def _compiled_anchors_at(all_anchors, s):
+    """Choose when a kernel is compiled: what might be None or an array would have everything compiled again."""
+    if isinstance(all_anchors, types.NoneType):
+        return lambda all_anchors, s: None
+    return lambda all_anchors, s: all_anchors[s]
 
 
 @njit(cache=True, error_model="numpy")
 def record(system, strains, state, targets, drive, stepping, tape):
     """Take time steps in place and record them; the number of records, or -1 if one fails or there is no more room."""
     room, count, limit = tape.h.shape[0], 0, np.zeros(0)
+    no = room < 0  # False; for a literal everything would be compiled again
     tape.x[0] = state.x
     tape.velocity[0] = state.velocity
     tape.effort[0] = state.effort
@@ -95,7 +103,7 @@ def record(system, strains, state, targets, drive, stepping, tape):
     first = state.effort.copy()
     for k in range(targets.shape[0]):
         kept = copy_state(state)
-        if not march_rows(system, strains, state, targets[k : k + 1], drive, limit, stepping, False, False):
+        if not march_rows(system, strains, state, targets[k : k + 1], drive, limit, stepping, no, no):
             return -1
         parts = int(state.totals[6])
         if count + parts > room:
@@ -120,7 +128,7 @@ def record(system, strains, state, targets, drive, stepping, tape):
                 goal = targets[k : k + 1].copy()
                 if j < parts - 1:
                     goal[0] = first + share * (goal[0] - first)
-                if not march_rows(system, strains, state, goal, drive, limit, short, False, False):
+                if not march_rows(system, strains, state, goal, drive, limit, short, no, no):
                     return -1
                 if state.totals[6] > 1.0:
                     return -1
@@ -409,7 +417,7 @@ def go_back(system, strains, tape, count, drive, stepping, by_x, by_velocity, by
             stepping.stiffness_damping,
             held,
         )
-        assemble(body, y, tape.effort[s + 1], step, equations, True)
+        assemble(body, y, tape.effort[s + 1], step, equations, h > 0.0)  # True; a literal would compile all again
         if has_failed(equations.slides) or factorise_tangent(system, rows) < 0:
             return False
         invert_driven(factor, drive.driven)

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numba import types
+from numba.extending import overload
 
 from softgym_envs.mechanics.compilation import njit
 from softgym_envs.mechanics.solvers.beam_body import (
@@ -183,11 +185,22 @@ def body_of(all_bodies, k):
     )
 
 
-@njit(cache=True, error_model="numpy")
 def _contact(c, k):
     """Return the points of body ``k``, or None for bodies that touch nothing."""
-    if c is None:
-        return None
+    return None if c is None else _points(c, k)
+
+
+@overload(_contact)
+def _compiled_contact(c, k):
+    """Choose when a kernel is compiled, as for `_row`."""
+    if isinstance(c, types.NoneType):
+        return lambda c, k: None
+    return lambda c, k: _points(c, k)
+
+
+@njit(cache=True, error_model="numpy")
+def _points(c, k):
+    """Return the points of body ``k``."""
     return ContactPoints(
         c.groups[k],
         c.frames[k],
@@ -204,12 +217,17 @@ def _contact(c, k):
     )
 
 
-@njit(cache=True, error_model="numpy")
 def _row(array, k):
     """Return a copy of row ``k``, or None."""
-    if array is None:
-        return None
-    return array[k].copy()
+    return None if array is None else array[k].copy()
+
+
+@overload(_row)
+def _compiled_row(array, k):
+    """Choose when a kernel is compiled: what might be None or an array would have everything compiled again."""
+    if isinstance(array, types.NoneType):
+        return lambda array, k: None
+    return lambda array, k: array[k].copy()
 
 
 @njit(cache=True, error_model="numpy")

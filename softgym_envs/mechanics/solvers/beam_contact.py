@@ -8,7 +8,7 @@ Kernels take None in place of `ContactPoints` for bodies that touch nothing, and
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -21,13 +21,17 @@ from softgym_envs.mechanics.contact.compiled import (
     table_of,
     touch_point,
 )
-from softgym_envs.mechanics.contact.contact import Contact
 from softgym_envs.mechanics.contact.obstacles import MeshObstacle, Obstacle
-from softgym_envs.mechanics.frames import Frames
 from softgym_envs.mechanics.solvers.block_cholesky import SIZE
+
+if TYPE_CHECKING:  # kernels do not depend on them, see `compilation`
+    from softgym_envs.mechanics.contact.contact import Contact
+    from softgym_envs.mechanics.frames import Frames
 
 MAX_SLIDING = 160
 """Points that may slide at once; the general solver takes over beyond it."""
+MAX_TOUCHING = 64
+"""Points that may touch in one Newton step; the general solver takes over beyond it."""
 NEAREST = 0.3
 """Part of its gap, or of the distance of contact if that is smaller, that a point keeps in one Newton step."""
 
@@ -66,6 +70,50 @@ class ContactPoints(NamedTuple):
     law: np.ndarray
 
 
+class LocalForces(NamedTuple):
+    """Forces at points that may touch, on the linearised body; work arrays for k points, which have 3 k components.
+
+    Attributes:
+        number: how many points are chosen, shape (1,).
+        points: their numbers, shape (k,).
+        group: their groups, shape (k,).
+        place: where they are [m], shape (k, 3).
+        free: their motion under the present forces [m], shape (3 k,).
+        start: present forces on them [N], shape (3 k,).
+        force: forces on them [N], shape (3 k,).
+        limit: of friction [N], shape (k, o).
+        pull: minus what contact does to them [N], shape (3 k,).
+        tangent: its derivative, shape (k, 3, 3).
+        residual: by how much forces and contact differ [N], shape (3 k,).
+        motion: what that moves [m], shape (3 k,).
+        compliance: motion by forces, with driven rows held [m/N], shape (3 k, 3 k).
+        relief: minus the efforts of driven rows by the forces, shape (size, 3 k).
+        half: ``L^-1`` times the forces, shape (3 k, b, 6).
+        axes: unit vectors, shape (3, 3).
+        p: a point [m], shape (3,).
+        smooth: an obstacle without friction, shape (17,).
+    """
+
+    number: np.ndarray
+    points: np.ndarray
+    group: np.ndarray
+    place: np.ndarray
+    free: np.ndarray
+    start: np.ndarray
+    force: np.ndarray
+    limit: np.ndarray
+    pull: np.ndarray
+    tangent: np.ndarray
+    residual: np.ndarray
+    motion: np.ndarray
+    compliance: np.ndarray
+    relief: np.ndarray
+    half: np.ndarray
+    axes: np.ndarray
+    p: np.ndarray
+    smooth: np.ndarray
+
+
 class Slides(NamedTuple):
     """Terms of sliding points in a tangent, and work arrays of contact.
 
@@ -80,6 +128,7 @@ class Slides(NamedTuple):
         q: another one [m], shape (3,).
         arms: its arms along the directors of its frames [m], shape (F, 3).
         slip: work array, shape (s,).
+        local: forces at points that may touch.
     """
 
     number: np.ndarray
@@ -92,10 +141,11 @@ class Slides(NamedTuple):
     q: np.ndarray
     arms: np.ndarray
     slip: np.ndarray
+    local: LocalForces
 
 
-def make_slides(contact: ContactPoints | None, blocks: int) -> Slides | None:
-    """Return arrays for a body with ``blocks`` movable frames, or None for one without contact."""
+def make_slides(contact: ContactPoints | None, blocks: int, size: int) -> Slides | None:
+    """Return arrays for a body with ``blocks`` movable frames and ``size`` rows, or None for one without contact."""
     if contact is None:
         return None
     points = len(contact.area)
@@ -111,6 +161,32 @@ def make_slides(contact: ContactPoints | None, blocks: int) -> Slides | None:
         q=np.zeros(3),
         arms=np.zeros((contact.frames.shape[1], 3)),
         slip=np.zeros(most),
+        local=_make_local(contact, blocks, size),
+    )
+
+
+def _make_local(contact: ContactPoints, blocks: int, size: int) -> LocalForces:
+    """Return work arrays for forces at points."""
+    k = min(MAX_TOUCHING, len(contact.area))
+    return LocalForces(
+        number=np.zeros(1, dtype=np.int64),
+        points=np.zeros(k, dtype=np.int64),
+        group=np.zeros(k, dtype=np.int64),
+        place=np.zeros((k, 3)),
+        free=np.zeros(3 * k),
+        start=np.zeros(3 * k),
+        force=np.zeros(3 * k),
+        limit=np.zeros((k, len(contact.obstacles))),
+        pull=np.zeros(3 * k),
+        tangent=np.zeros((k, 3, 3)),
+        residual=np.zeros(3 * k),
+        motion=np.zeros(3 * k),
+        compliance=np.zeros((3 * k, 3 * k)),
+        relief=np.zeros((size, 3 * k)),
+        half=np.zeros((3 * k, blocks, SIZE)),
+        axes=np.eye(3),
+        p=np.zeros(3),
+        smooth=np.zeros(contact.obstacles.shape[1]),
     )
 
 
@@ -203,6 +279,15 @@ def point_at(contact, g, k, x, out):
 
 
 @njit(cache=True, error_model="numpy")
+def fill_arms(contact, g, k, x, out):
+    """Fill the arms (F, 3) of a point [m] of group ``g`` along the directors of its frames."""
+    for f in range(contact.frames.shape[1]):
+        row, w = contact.frames[g, f], contact.weights[k, f]
+        for d in range(3):
+            out[f, d] = w[1] * x[row + 1, d] + w[2] * x[row + 2, d] + w[3] * x[row + 3, d]
+
+
+@njit(cache=True, error_model="numpy")
 def spread_of(contact, g, x):
     """Return a bound of the distance of the points of group ``g`` from the origin of its first frame [m]."""
     first, value = contact.frames[g, 0], contact.reach[g, 0]
@@ -245,10 +330,7 @@ def add_contact(contact, slides, x, anchors, equations, full):
                             gradient[row + m, d] += w[m] * pull[d]
                 if not full:
                     continue
-                for f in range(width):
-                    row, w = contact.frames[g, f], contact.weights[k, f]
-                    for d in range(3):
-                        arms[f, d] = w[1] * x[row + 1, d] + w[2] * x[row + 2, d] + w[3] * x[row + 3, d]
+                fill_arms(contact, g, k, x, arms)
                 for f in range(width):
                     for h in range(width):
                         if contact.place[g, f, h] >= 0:
@@ -265,12 +347,12 @@ def add_contact(contact, slides, x, anchors, equations, full):
                     for f in range(width):
                         if contact.blocks[g, f] >= 0:
                             b, share = contact.blocks[g, f], contact.weights[k, f, 0]
-                            _add_wrench(found.direction, arms[f], share, slides.direction[s, b])
-                            _add_wrench(found.loading, arms[f], share, slides.loading[s, b])
+                            add_wrench(found.direction, arms[f], share, slides.direction[s, b])
+                            add_wrench(found.loading, arms[f], share, slides.loading[s, b])
 
 
 @njit(cache=True, error_model="numpy")
-def _add_wrench(force, arm, share, out):
+def add_wrench(force, arm, share, out):
     """Add to ``out`` (6,) what a force (3,) at a point does to a frame that moves it by ``share u + w x arm``."""
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3

@@ -11,17 +11,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from softgym_envs.mechanics.compilation import njit
 from softgym_envs.mechanics.contact.compiled import quick_gap
-from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.beam_batch import body_of, stacked
 from softgym_envs.mechanics.solvers.beam_body import FIXED, BeamBody, beam_body, reason_for_general
 from softgym_envs.mechanics.solvers.beam_contact import catch_up, has_failed, point_at
 from softgym_envs.mechanics.solvers.beam_equations import Step, assemble, point_strains
+
+if TYPE_CHECKING:  # kernels do not depend on it, see `compilation`
+    from softgym_envs.mechanics.model import MechanicalModel
 
 
 @dataclass(frozen=True)
@@ -232,7 +234,7 @@ def by_bodies(bodies, loads, nodes, own, equations, strains, tape, count, drive,
             _placed(body, tape.x[s + 1], nodes[k], own, now)
             point_strains(body.elements, before, strains)
             step = Step(before, velocity, strains, loads[k], h, stepping.mass_damping, stepping.stiffness_damping, held)
-            assemble(body, now, tape.effort[s + 1], step, equations, False)
+            assemble(body, now, tape.effort[s + 1], step, equations, not step.h > 0.0)
             if has_failed(equations.slides):
                 return False
             for b in range(equations.residual.shape[0]):

@@ -86,7 +86,7 @@ def make_equations(body: BeamBody, size: int) -> Equations:
         delta=np.zeros(size),
         H=np.zeros((size, count, SIZE)),
         energy=np.zeros(1),
-        slides=make_slides(body.contact, count),
+        slides=make_slides(body.contact, count, size),
     )
 
 
@@ -524,6 +524,12 @@ def _hold(pattern, components, equations):
 @njit(cache=True, error_model="numpy")
 def assemble(body, x, effort, step, equations, full):
     """Fill the equations at rows ``x`` (n, 3) and efforts (size,); tangent and ``H`` only if ``full``."""
+    assemble_parts(body, x, effort, step, equations, full, full)
+
+
+@njit(cache=True, error_model="numpy")
+def assemble_parts(body, x, effort, step, equations, full, touching):
+    """Fill the equations as `assemble`, the stiffness of contact only if ``touching``."""
     gradient = equations.gradient
     for row in range(x.shape[0]):
         for d in range(3):
@@ -534,13 +540,16 @@ def assemble(body, x, effort, step, equations, full):
     _add_drag(body.elements, x, step, equations, full)
     _add_inertia(body.masses, x, step, equations, full)
     add_constraints(body, x, effort, equations, full)
-    add_contact(body.contact, equations.slides, x, step.anchors, equations, full)
+    if full and not touching:  # pressed bodies may be unstable without the stiffness of what presses on them
+        add_curvature(body.frames, x, gradient, equations.tangent)
+    add_contact(body.contact, equations.slides, x, step.anchors, equations, touching)
     reduce_forces(body.frames, x, gradient, equations.residual)
     free, residual = body.components.free, equations.residual
     for k in range(free.shape[0]):
         for i in range(6):
             residual[k, i] *= free[k, i]
     if full:
-        add_curvature(body.frames, x, gradient, equations.tangent)
+        if touching:
+            add_curvature(body.frames, x, gradient, equations.tangent)
         _hold(body.pattern, body.components, equations)
         hold_slides(equations.slides, free)

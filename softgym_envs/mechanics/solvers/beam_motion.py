@@ -10,16 +10,13 @@ in halves.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numba import types
 from numba.extending import overload
 
-from softgym_envs.mechanics.assembly import MassMatrix
 from softgym_envs.mechanics.compilation import njit
-from softgym_envs.mechanics.contact.contact import Contact, ContactMemory, Contacts
-from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.beam_body import beam_body
 from softgym_envs.mechanics.solvers.beam_contact import (
     ContactPoints,
@@ -46,10 +43,15 @@ from softgym_envs.mechanics.solvers.beam_newton import (
     invert_driven,
     make_system,
     solve,
-    solve_in_contact,
 )
+from softgym_envs.mechanics.solvers.beam_touching import solve_touching
 from softgym_envs.mechanics.solvers.block_cholesky import SIZE
 from softgym_envs.mechanics.solvers.equilibrium import SATURATED
+
+if TYPE_CHECKING:  # kernels do not depend on them, see `compilation`
+    from softgym_envs.mechanics.assembly import MassMatrix
+    from softgym_envs.mechanics.contact.contact import Contact, ContactMemory, Contacts
+    from softgym_envs.mechanics.model import MechanicalModel
 
 INCREMENTS = 4
 """In statics, a step that is too long for Newton's method is divided once into this number of increments."""
@@ -138,12 +140,17 @@ class Stepping(NamedTuple):
     cuts: int
 
 
-@njit(cache=True, error_model="numpy")
 def _copied(array):
     """Return a copy of an array, or None."""
-    if array is None:
-        return None
-    return array.copy()
+    return None if array is None else array.copy()
+
+
+@overload(_copied)
+def _compiled_copied(array):
+    """Choose when a kernel is compiled: what might be None or an array would have everything compiled again."""
+    if isinstance(array, types.NoneType):
+        return lambda array: None
+    return lambda array: array.copy()
 
 
 @njit(cache=True, error_model="numpy")
@@ -218,7 +225,7 @@ def _find(system, x, effort, target, drive, step, stepping, fresh, easy):
     """Solve the equations of one time step from the predicted rows; the iterations, or -1 on failure."""
     if system.body.contact is None:
         return _find_free(system, x, effort, target, drive, step, stepping, fresh, easy)
-    return solve_in_contact(system, x, effort, target, drive, step, stepping.tolerance, fresh)
+    return solve_touching(system, x, effort, target, drive, step, stepping.tolerance, fresh)
 
 
 @overload(_find, inline="always")
@@ -228,7 +235,7 @@ def _compiled_find(system, x, effort, target, drive, step, stepping, fresh, easy
         return lambda system, x, effort, target, drive, step, stepping, fresh, easy: _find_free(
             system, x, effort, target, drive, step, stepping, fresh, easy
         )
-    return lambda system, x, effort, target, drive, step, stepping, fresh, easy: solve_in_contact(
+    return lambda system, x, effort, target, drive, step, stepping, fresh, easy: solve_touching(
         system, x, effort, target, drive, step, stepping.tolerance, fresh
     )
 
@@ -253,8 +260,9 @@ def _advance(system, strains, state, target, drive, stepping, h, fresh, easy, fi
     if iterations < 0:
         return False
     # At the end of the step: all compliances where they are asked for, else values and energies alone.
+    # With a literal in place of ``finish``, everything would be compiled again.
     if finish:
-        assemble(body, x, effort, step, equations, True)
+        assemble(body, x, effort, step, equations, finish)
         if has_failed(equations.slides):
             return False
         negative = factorise_tangent(system, np.arange(size))
@@ -262,7 +270,7 @@ def _advance(system, strains, state, target, drive, stepping, h, fresh, easy, fi
         if negative < 0 or (negative and h == np.inf):
             return False
     else:
-        add_constraints(body, x, effort, equations, False)
+        add_constraints(body, x, effort, equations, finish)
     totals[1], totals[4] = equations.energy[0], iterations
     if h == np.inf:
         return True
@@ -297,7 +305,8 @@ def march_rows(system, strains, state, targets, drive, limit, stepping, finish, 
     kept, effort = copy_state(state), state.effort
     first, goal = np.empty(effort.shape[0]), np.empty(effort.shape[0])
     orthonormalise(system.body.frames, state.x)
-    add_constraints(system.body, state.x, effort, system.equations, False)
+    without = not stepping.h > 0.0  # no literal, for which everything would be compiled again
+    add_constraints(system.body, state.x, effort, system.equations, without)
     state.delta[:] = system.equations.delta
     fresh = not known
     if known:
@@ -368,7 +377,7 @@ def march(system, strains, state, targets, is_driven, unilateral, limit, steppin
             saturated = saturated or free[i] != is_driven[i]
         if not saturated:
             follows = known and taken == 0 and not drive.one_way.any()
-            done = march_rows(system, strains, state, targets[taken:], drive, bound, stepping, True, follows)
+            done = march_rows(system, strains, state, targets[taken:], drive, bound, stepping, not saturated, follows)
             taken += done
             if done or count == 0:
                 if done == 0:
@@ -383,7 +392,7 @@ def march(system, strains, state, targets, is_driven, unilateral, limit, steppin
                 if is_driven[i] and not free[i]:
                     target[0, i] = sign[i] * bound[i]
             among, last = drive_rows(free, unilateral), taken == steps - 1
-            if not march_rows(system, strains, state, target, among, np.zeros(0), stepping, last, False):
+            if not march_rows(system, strains, state, target, among, np.zeros(0), stepping, last, not saturated):
                 break
             consistent = True
             for i in range(count):
@@ -568,6 +577,8 @@ def memory_of(contact: ContactPoints, anchors: np.ndarray, memory: ContactMemory
 
 def contacts_of(contact: Contact, points: ContactPoints, slides: Slides, x: np.ndarray) -> Contacts:
     """Return where a body touches at rows ``x`` (n, 3) at the end of the last time step."""
+    from softgym_envs.mechanics.contact.contact import Contacts
+
     numbers, values = np.empty((len(points.area), 3), dtype=np.int64), np.empty((len(points.area), 8))
     count = touching(points, slides, x, slides.before, numbers, values)
     numbers, values = numbers[:count], values[:count]

@@ -1,7 +1,8 @@
 """Newton's method for bodies of beams, compiled: equations are linearised, factorised and solved for one time step.
 
 `solve` takes whole steps and keeps its factor while it converges fast. `approach` shortens steps and divides the way to
-the target into increments, as `Statics` does. `solve_in_contact` takes steps as far as no point enters an obstacle.
+the target into increments, as `Statics` does. `solve_in_contact` takes steps as far as no point enters an obstacle;
+`beam_touching` goes on where it fails.
 """
 
 from __future__ import annotations
@@ -176,7 +177,7 @@ def invert_driven(factor, driven):
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
-def _correct(system, effort, target, drive):
+def correct(system, effort, target, drive):
     """Solve the linearised equations for the steps of the motions and of the efforts, as `Statics` does.
 
     Returns the largest displacement of the step; NaN if no set of taut actuators is consistent.
@@ -238,7 +239,7 @@ def _linearise(system, x, effort, step, drive, rows, definite):
     Only positive definite tangents count if ``definite``, or if there are ``one_way`` rows, whose complementarity needs
     them.
     """
-    assemble(system.body, x, effort, step, system.equations, True)
+    assemble(system.body, x, effort, step, system.equations, step.h > 0.0)  # True; a literal would compile all again
     if has_failed(system.equations.slides):
         return -1
     negative, one_way = factorise_tangent(system, rows), drive.one_way.any()
@@ -267,12 +268,12 @@ def solve(system, x, effort, target, drive, step, tolerance, fresh):
     enough = min(tolerance, max(REMAINING * tolerance, SMALLEST))
     for iteration in range(1, MAX_ITERATIONS + 1):
         if not fresh:
-            assemble(body, x, effort, step, equations, False)
+            assemble(body, x, effort, step, equations, fresh)
         elif _linearise(system, x, effort, step, drive, rows, static) < 0:
             return -1
         else:
             taken = 0
-        length = _correct(system, effort, target, drive)
+        length = correct(system, effort, target, drive)
         if not length <= TOO_LONG * radian:  # also true for NaN
             return -1
         ratio = length / before if iteration > 1 else 1.0
@@ -312,7 +313,7 @@ def _search(system, x, effort, target, drive, step, tolerance, definite):
     body, equations, factor = system
     rows = np.concatenate((drive.driven, drive.forced))
     begin, begin_effort, stride, pull = x.copy(), effort.copy(), factor.step.copy(), factor.efforts.copy()
-    norm = _correct(system, effort, target, drive)
+    norm = correct(system, effort, target, drive)
     part = 1.0
     for iteration in range(1, MAX_SEARCHES + 1):
         if not np.isfinite(norm):
@@ -329,8 +330,8 @@ def _search(system, x, effort, target, drive, step, tolerance, definite):
             move(body.frames, x, factor.step, factor.turned)
             for c in range(effort.shape[0]):
                 effort[c] = begin_effort[c] + part * pull[c]
-            assemble(body, x, effort, step, equations, False)
-            remaining = _correct(system, effort, target, drive)
+            assemble(body, x, effort, step, equations, not step.h > 0.0)
+            remaining = correct(system, effort, target, drive)
             if remaining <= (1.0 - 0.25 * part) * norm or remaining <= tolerance:
                 break
             part *= 0.5
@@ -342,7 +343,7 @@ def _search(system, x, effort, target, drive, step, tolerance, definite):
                 effort[c] += factor.efforts[c]
         if _linearise(system, x, effort, step, drive, rows, definite) < 0:
             return -1
-        norm = _correct(system, effort, target, drive)
+        norm = correct(system, effort, target, drive)
         if part == 1.0 and norm <= tolerance:
             return iteration
         part = min(1.0, 2.0 * part)
@@ -393,7 +394,7 @@ def approach(system, x, effort, target, drive, step, tolerance):
 
 
 @njit(cache=True, error_model="numpy")
-def _take(system, kept, x, stride, part):
+def take(system, kept, x, stride, part):
     """Move rows ``x`` by a part of a step from those ``kept``."""
     factor, x[:] = system.factor, kept
     for k in range(stride.shape[0]):
@@ -414,8 +415,8 @@ def _part_of_step(system, kept, x, stride, effort, step, most, start):
     ones = np.ones_like(stride)
     low, high, part, below, above = 0.0, most, most, start, np.inf
     for trial in range(MAX_TRIALS):
-        _take(system, kept, x, stride, part)
-        assemble(body, x, effort, step, equations, False)
+        take(system, kept, x, stride, part)
+        assemble(body, x, effort, step, equations, not step.h > 0.0)
         along = np.inf if has_failed(equations.slides) else _dot(equations.residual, stride, ones)
         if abs(along) <= BALANCED * abs(start) or (trial == 0 and along < 0.0):
             break
@@ -447,11 +448,11 @@ def solve_in_contact(system, x, effort, target, drive, step, tolerance, fresh):
             taken = 0
         else:
             number = equations.slides.number[0]  # that of the factor, which stays as it is
-            assemble(body, x, effort, step, equations, False)
+            assemble(body, x, effort, step, equations, not step.h > 0.0)
             if has_failed(equations.slides):
                 return -1
             equations.slides.number[0] = number
-        length = _correct(system, effort, target, drive)
+        length = correct(system, effort, target, drive)
         if not length < np.inf:  # also true for NaN
             return -1
         ratio = length / before if before < np.inf else 1.0
@@ -469,7 +470,7 @@ def solve_in_contact(system, x, effort, target, drive, step, tolerance, fresh):
         kept[:] = x
         part, free = min(1.0, LONGEST * radian / length), 0.0
         while free < 1.0:
-            _take(system, kept, x, stride, part)
+            take(system, kept, x, stride, part)
             free = free_part(body.contact, equations.slides, kept, x)
             part *= free  # the way bends, so it is tested again
             if part < SHORTEST:
