@@ -185,7 +185,7 @@ def _effort(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:
     return Finding(
         "The winner pulls harder" if "largest_effort" in limits else "The winner strains more",
         f"On FEM its {' and its '.join(parts)}: part of its gain may be the stronger drive. A study with constraints "
-        f"on {' and '.join(limits)} compares bodies at equal cost.",
+        f"on {' and '.join(limits)} would compare them at equal cost.",
     )
 
 
