@@ -14,7 +14,7 @@ from typing import Any, Literal, TypeAlias, TypeVar, Union, get_args, get_origin
 import numpy as np
 from numpy.typing import ArrayLike
 
-from softgym_envs.errors import SoftGymError, unknown_name
+from softgym_envs.errors import SoftGymError
 from softgym_envs.wording import brief, counted
 
 T = TypeVar("T")
@@ -183,7 +183,8 @@ def described(annotation: Annotation) -> str:
     if origin is tuple and set(arguments) <= {int, float}:
         return counted(len(arguments), "number")
     if origin in (Sequence, Iterable, tuple):
-        return f"a list, each of which is {described(arguments[0])}" if arguments else "a list"
+        plain = not arguments or arguments[0] is Any
+        return "a list" if plain else f"a list, each of which is {described(arguments[0])}"
     if origin is Mapping or annotation is Mapping:
         return "a mapping from names to values"
     if origin is Callable or annotation is Callable:
@@ -192,13 +193,13 @@ def described(annotation: Annotation) -> str:
     return str(words.get(annotation) or getattr(annotation, "__name__", annotation))
 
 
-def choice(kind: str, value: object, allowed: Iterable[str]) -> str:
-    """Return a value that must be one of some names.
+def choice(name: str, value: object, allowed: Iterable[str]) -> str:
+    """Return the value of an argument, which must be one of some words.
 
     Raises:
-        ValueError: for another name, or no name at all.
+        ValueError: for another word, or no word at all.
     """
     allowed = list(allowed)
     if not isinstance(value, str) or value not in allowed:
-        raise ValueError(unknown_name(kind, value if isinstance(value, str) else brief(value), allowed))
+        raise ValueError(f"{name} = {brief(value)} is unknown; allowed: {', '.join(map(repr, allowed))}")
     return value

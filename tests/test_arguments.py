@@ -179,5 +179,5 @@ def test_kinds():
     assert is_a(np.bool_(True), bool) and is_a(np.float32(1.0), float) and not is_a(1, bool)
     assert is_a([1, 2], tuple[int, int]) and not is_a([1], tuple[int, int])
     assert choice("mode", "effort", ("displacement", "effort")) == "effort"
-    with pytest.raises(ValueError, match=r"unknown mode '\[1, 2\]'; allowed: displacement, effort"):
+    with pytest.raises(ValueError, match=r"mode = \[1, 2\] is unknown; allowed: 'displacement', 'effort'"):
         choice("mode", [1, 2], ("displacement", "effort"))

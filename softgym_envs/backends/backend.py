@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from softgym_envs.arguments import choice
 from softgym_envs.designs import Design
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.quantities import check_quantity
@@ -194,8 +195,7 @@ def check_command(robot: Robot, command: object, mode: str) -> np.ndarray:
             so far beyond the range of its actuator, or an effort so far beyond what is typical of it, that its unit is
             probably wrong.
     """
-    if mode not in ("displacement", "effort"):
-        raise ValueError(f"mode = {mode!r} is unknown; allowed: 'displacement', 'effort'")
+    choice("mode", mode, ("displacement", "effort"))
     array = check_numbers("command", command, len(robot.actuators))
     if mode == "effort":
         for actuator, value, typical in zip(robot.actuators, array.tolist(), robot.effort_scale.tolist(), strict=True):

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softgym_envs.arguments import choice
 from softgym_envs.backends.backend import (
     Backend,
     Ground,
@@ -325,7 +324,7 @@ class FEMBackend(Backend):
             cable.friction = self._friction
 
     def step(self, command: np.ndarray, mode: str = "displacement", *, force: np.ndarray | None = None) -> State:
-        command = self._checked(command, mode)
+        command = check_command(self.robot, command, mode)
         load = None
         if force is not None:
             load = np.zeros(self.state.effector.size)
@@ -344,14 +343,10 @@ class FEMBackend(Backend):
             raise
         return self.state
 
-    def _checked(self, command: np.ndarray, mode: str) -> np.ndarray:
-        choice("mode", mode, ("displacement", "effort"))
-        return check_command(self.robot, command, mode)
-
     def probe(self, command: np.ndarray, mode: str = "displacement") -> State:
         """Return the static equilibrium under a command, found from the present shape, without going there."""
         kept = self._motion
-        command = self._checked(command, mode)
+        command = check_command(self.robot, command, mode)
         try:
             if self._dynamics is not None:
                 self.restore(self.state)  # statics are where they were left before the last steps of the motion
