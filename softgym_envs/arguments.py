@@ -183,8 +183,10 @@ def described(annotation: Annotation) -> str:
     if origin is tuple and set(arguments) <= {int, float}:
         return counted(len(arguments), "number")
     if origin in (Sequence, Iterable, tuple):
-        plain = not arguments or arguments[0] is Any
-        return "a list" if plain else f"a list, each of which is {described(arguments[0])}"
+        if not arguments or arguments[0] is Any:
+            return "a list"
+        plural = {str: "strings", int: "integers", float: "numbers"}.get(arguments[0])
+        return f"a list of {plural}" if plural else f"a list, each of which is {described(arguments[0])}"
     if origin is Mapping or annotation is Mapping:
         return "a mapping from names to values"
     if origin is Callable or annotation is Callable:

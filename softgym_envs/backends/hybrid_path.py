@@ -123,7 +123,8 @@ class PathHybridBackend(Backend):
         if found is not None and found.trusted:
             return found
         fem = self._follow(known.fem, known.path)
-        fem.touch(self._touch)
+        if self.takes_touch:
+            fem.touch(self._touch)
         self.fem_calls += 1
         return fem.probe(command, mode)
 
@@ -182,7 +183,8 @@ class PathHybridBackend(Backend):
         fem = self._fem_of(self.design)
         fem.restore(fem.reset() if start is None else start)
         for command, mode, touch in path:
-            fem.touch(touch)
+            if self.takes_touch:
+                fem.touch(touch)
             fem.step(command, mode)
             self.fem_calls += 1
         return fem

@@ -370,6 +370,7 @@ class ShapeCheck:
         """Warn once of outer walls that cross each other at the rows of a state [m], shape (n, 3).
 
         States farther from rest than all before them are checked, and one of `CHECKED` others, which costs nothing.
+        Triangles of which another touches both are neighbours, and may cross.
         """
         if not len(self._outside) or self._name in _TOLD:
             return
@@ -377,7 +378,13 @@ class ShapeCheck:
         if away <= self._farthest and self._since < CHECKED:
             return
         self._farthest, self._since = max(away, self._farthest), 0
-        if (found := _crossing(x, self._outside, len(self._outside))) is None:
+        while (found := _crossing(x, self._outside, len(self._outside))) is not None:
+            # Neighbours on the surface fold over each other at slivers of the mesh, where the body only bends.
+            first, second = (np.isin(self._outside, self._outside[each]).any(axis=1) for each in found[:2])
+            if not (first & second).any():
+                break
+            self._outside = np.delete(self._outside, found[:2], axis=0)
+        if found is None:
             return
         assert self._rest is not None
         if _crossing(self._rest, self._outside, len(self._outside)) is not None:  # parts that overlap by construction

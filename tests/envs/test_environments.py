@@ -12,6 +12,7 @@ from gymnasium.utils.env_checker import check_env
 import softgym_envs
 from softgym_envs import make_robot
 from softgym_envs.backends.registry import BACKENDS as ALL_BACKENDS
+from softgym_envs.envs.tasks.locomotion import Locomotion
 from softgym_envs.envs.tasks.registry import make_task
 from softgym_envs.errors import ConvergenceError, DesignError
 from softgym_envs.robots.base import Robot
@@ -144,19 +145,19 @@ def test_bounds_time_limit_and_info(identifier, options, episodes, action_mode):
             steps += 1
             assert env.observation_space.contains(observation)
             assert terminated == info["is_failed"]
-            assert 0.0 <= reward <= 1.0 or env.unwrapped.task.name == "walk"  # a speed
+            assert 0.0 <= reward <= 1.0 or isinstance(env.unwrapped.task, Locomotion)  # a speed
             assert (np.abs(env.unwrapped.state.command - before) <= env.unwrapped.robot.rates + 1e-15).all()
         assert steps == limit or terminated
     assert set(info) >= {"effector", "goal", "distance", "is_success", "displacement", "effort"}
     task = env.unwrapped.task
-    if task.name not in ("carry", "grasp", "walk"):  # whose distances count one side only, are relative, or velocities
+    if task.name not in ("carry", "grasp", "walk", "swim"):  # whose distances count one side only, are relative, or velocities
         error = task.axes * (info["effector"] - info["goal"])
         assert info["distance"] == pytest.approx(np.linalg.norm(error), abs=1e-12)
     assert info["is_success"] == (info["distance"] < env.unwrapped.task.success_distance)
     assert info["converged"]
     check_info(info)
     terms = [value for name, value in info.items() if name.startswith("reward_")]
-    combined = np.sum(terms) if task.name == "walk" else np.prod(terms)
+    combined = np.sum(terms) if isinstance(task, Locomotion) else np.prod(terms)
     assert len(terms) >= 2 and reward == pytest.approx(combined)
     unilateral = env.unwrapped.robot.unilateral
     assert (info["effort"][unilateral] >= 0.0).all()
@@ -200,8 +201,8 @@ def test_rows_choose_the_backend_and_make_vec_follows():
 def test_a_surrogate_without_weights_names_the_shipped_ones():
     from softgym_envs.errors import WeightsError
 
-    with pytest.raises(WeightsError, match=r"'modular_arm'.*finger_1cable, finger_2cables"):
-        gymnasium.make("SoftGym/ModularReach-v0", backend="hybrid")
+    with pytest.raises(WeightsError, match=r"'silicone_beam_coarse'.*finger_1cable, finger_2cables"):
+        gymnasium.make("SoftGym/Reach-v0", robot="silicone_beam", backend="surrogate")
 
 
 @pytest.mark.parametrize("identifier", [i for i, row in softgym_envs.ENVIRONMENTS.items() if row.task == "track"])

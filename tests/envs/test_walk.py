@@ -188,7 +188,7 @@ def test_vector_environments_walk_alike():
         ({"payload": 20.0}, r"payload = 20 kg is implausible, allowed: 0 to 2 kg"),
         ({"push": 100.0}, r"push = 100 N is implausible"),
         ({"friction": (1.0, 0.5)}, r"friction = \(1.0, 0.5\) must be a number or a range"),
-        ({"friction": "icy"}, "friction = icy must be a number or a range"),
+        ({"friction": "icy"}, "friction = 'icy' must be a number or a list"),
         ({"slope": (0.0, 0.6)}, "allowed: -0.5 to 0.5 rad"),
         ({"slope": 0.4, "friction": (0.3, 1.0)}, "slope = 0.4 rad is too steep for friction"),
     ],

@@ -27,8 +27,8 @@ def chain(energies, cavity=None, gravity=(0.0, 0.0, 0.0), mass=0.0):
             builder, *ports[-2:], energy, length=LENGTH, cavity=cavity, inertia=point_masses(mass) if mass else None
         )
     model = builder.build()
-    for block in model.blocks if cavity is not None else ():
-        model.add("a", PortCavity("pressure", block))
+    for number, block in enumerate(model.blocks if cavity is not None else (), start=1):
+        model.add("a", PortCavity(f"pressure {number}", block))
     model.add("e", Point("tip", EmbeddedPoints.in_frame(ports[-1], np.zeros(3), model.nodes)))
     return model, ports
 

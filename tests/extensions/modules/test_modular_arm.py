@@ -135,9 +135,9 @@ def test_cells_are_an_option_and_their_dimensions_the_design():
     [
         ({"cells": ["leaf_z"]}, "unknown cell 'leaf_z'"),
         ({"cells": []}, "list of names"),
-        ({"cells": True}, "list of names"),
+        ({"cells": True}, "cells = True must be a list of strings or an integer"),
         ({"cells": 13}, "cells = 13 is out of bounds; allowed: 1 to 12"),
-        ({"cells": 2.5}, "cells must be a number or a list of names, got 2.5"),
+        ({"cells": 2.5}, "cells = 2.5 must be a list of strings or an integer"),
         ({"body": "fem"}, "'fem'"),
         ({"cells": 2, "kinds": ["leaf"]}, "unknown kind 'leaf'"),
         ({"cells": 2, "kinds": []}, "kinds must be a list of names"),
