@@ -32,7 +32,7 @@ LAYERS = [
     {"softgym_envs.envs"},
     {"softgym_envs.agents"},
     {"softgym_envs.codesign"},
-    {"softgym_envs.viewer"},
+    {"softgym_envs.viewer", "softgym_envs.testing"},
     {"softgym_envs.cli"},
     # Extensions: no core package imports one. Those of one layer do not know each other.
     {"softgym_envs.extensions", "softgym_envs.extensions.design", "softgym_envs.extensions.sweeps"},

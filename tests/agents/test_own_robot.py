@@ -16,7 +16,7 @@ from softgym_envs.errors import ConfigError
 from softgym_envs.robots.soft_finger import SoftFinger
 
 MODULE = """
-from tests import helpers as testing
+from softgym_envs import testing
 from softgym_envs.envs.tasks.reach import Reach
 
 

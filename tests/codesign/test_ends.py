@@ -26,7 +26,7 @@ from softgym_envs.codesign.study import run_study
 from softgym_envs.control.settling import nearest_next
 from softgym_envs.errors import ConfigError, ConvergenceError
 from softgym_envs.mechanics.solvers.statics import Statics
-from tests.helpers import wait_until
+from softgym_envs.testing import wait_until
 
 POLICY = "diamond_reach_designs"
 FINER = {"robot_options": {"mesh_size": 0.0065}, "goals": 2}

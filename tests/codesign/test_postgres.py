@@ -22,9 +22,9 @@ from softgym_envs.codesign.scheduling.postgres import HEARTBEAT, PostgresStorage
 from softgym_envs.codesign.scheduling.queue import TrialQueue
 from softgym_envs.codesign.study import run_study
 from softgym_envs.errors import ConfigError, DataError, SoftGymError
+from softgym_envs.testing import wait_until
 from tests.codesign.kills import Sweep, faults
 from tests.codesign.postgres_server import find_programs, temporary_server
-from tests.helpers import wait_until
 
 GRACE = 2.0
 

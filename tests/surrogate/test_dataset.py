@@ -32,7 +32,7 @@ from softgym_envs.surrogate.data.sampling import (
     solve_path,
 )
 from softgym_envs.surrogate.features import learned_variables
-from tests.helpers import live_processes, wait_until
+from softgym_envs.testing import live_processes, wait_until
 
 PLAN = SamplingPlan(groups=4, states=3, sequence="halton", seed=5)
 

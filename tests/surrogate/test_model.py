@@ -24,7 +24,7 @@ from softgym_envs.surrogate.pretrained import pretrained_folder, pretrained_mode
 from softgym_envs.surrogate.trainer import Trainer
 from softgym_envs.surrogate.training import FitConfig, fit, generate_datasets
 from softgym_envs.surrogate.weight_files import load_model
-from tests.helpers import random_states, untrained_potential
+from softgym_envs.testing import random_states, untrained_potential
 
 CABLES = (1, 2)
 

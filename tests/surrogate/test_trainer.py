@@ -16,7 +16,7 @@ from softgym_envs.surrogate.potential.torch import PotentialNet
 from softgym_envs.surrogate.potential.training import make_targets, potential_loss, unstack_members
 from softgym_envs.surrogate.pretrained import pretrained_model
 from softgym_envs.surrogate.trainer import Trainer
-from tests.helpers import random_states
+from softgym_envs.testing import random_states
 
 
 @pytest.mark.parametrize("schedule", ["cycle", "plateau"])

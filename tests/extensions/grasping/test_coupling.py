@@ -11,7 +11,7 @@ from softgym_envs.extensions.grasping.control.coupling import HeldObject, couple
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
-from tests.helpers import random_condensed_model
+from softgym_envs.testing import random_condensed_model
 
 TURN = np.diag([-1.0, -1.0, 1.0])  # half a turn about z
 SHIFT = np.array([0.0, 0.08, 0.0])

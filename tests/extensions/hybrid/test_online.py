@@ -15,7 +15,7 @@ from softgym_envs.surrogate.potential.model import Model
 from softgym_envs.surrogate.potential.training import stack_members, unstack_members
 from softgym_envs.surrogate.pretrained import pretrained_model
 from softgym_envs.surrogate.weight_files import load_model, save_model
-from tests.helpers import sample_states
+from softgym_envs.testing import sample_states
 
 LIMIT = 8e-3  # largest displacement in the training of `weights` [m]
 

@@ -1,4 +1,4 @@
-"""Helpers of tests: small meshes and bodies, derivatives, small surrogates, processes."""
+"""For tests, of the suite and of packages beside it: small meshes, bodies and surrogates, derivatives, processes."""
 
 from __future__ import annotations
 
