@@ -9,6 +9,8 @@ that is kept between designs, since starting one takes a hundred times as long a
 from __future__ import annotations
 
 import os
+import pickle
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -87,13 +89,14 @@ def _in_gmsh(function: Callable[..., Any], *arguments: Any) -> Any:
         InfeasibleDesign: if gmsh fails, crashes or takes too long.
     """
     from joblib.externals.loky import ProcessPoolExecutor, TimeoutError
+    from joblib.externals.loky.backend.reduction import dumps
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
     process = _processes.get(os.getpid())  # a copy of this process has none
     if process is None:
         process = _processes[os.getpid()] = ProcessPoolExecutor(max_workers=1, timeout=IDLE)
     try:
-        return process.submit(function, *arguments).result(timeout=TIME_LIMIT)
+        return process.submit(_called, sys.path, bytes(dumps((function, arguments)))).result(timeout=TIME_LIMIT)
     except TimeoutError:
         problem = f"drawing took longer than {TIME_LIMIT:g} s"
     except TerminatedWorkerError:  # OpenCASCADE crashes on some shapes
@@ -103,6 +106,13 @@ def _in_gmsh(function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 # -- in the process of gmsh -------------------------------------------------------------------------------------------
+
+
+def _called(path: list[str], call: bytes) -> Any:
+    """Call a function of a module that may lie where the other process looks for modules only since this one began."""
+    sys.path[:] = path
+    function, arguments = pickle.loads(call)
+    return function(*arguments)
 
 
 def _surface_nodes(
