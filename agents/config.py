@@ -277,7 +277,8 @@ class TrainConfig(LearnerConfig):
     Attributes:
         environment: what the policy is trained in.
         steps: environment steps, over all sub-environments.
-        initial: initial policy: a file or the name of a shipped one, for the same robot and goals of the same kind.
+        initial: initial policy: a file, the folder of a training or the name of a shipped one, for the same
+            robot and goals of the same kind.
         evaluation_episodes: number of episodes of each evaluation.
         report_every: environment steps between evaluations. Learners begin new episodes after each, so all
             sub-environments should make several episodes in between.

@@ -267,11 +267,8 @@ def check_agent(agent: str | Path) -> None:
     """
     name = str(agent)
     names = [*BASELINES, *shipped_policies()]
-    if name in names or name.endswith(".safetensors"):
+    if name in names or name.endswith(".safetensors") or (Path(name) / "policy.safetensors").is_file():
         return
-    policy = Path(name) / "policy.safetensors"
-    if policy.exists():
-        raise ConfigError(f"agent '{name}' is the folder of a training; its policy is {policy}")
     raise ConfigError(unknown_name("agent", name, names, other=POLICY_FILE))
 
 
@@ -279,7 +276,7 @@ def make_agent(agent: str | Path, seed: int = 0) -> Agent:
     """Return ``agent(observation, env.unwrapped) -> action``.
 
     Args:
-        agent: one of `BASELINES`, see `make_baseline`; or a policy file, or the name of a shipped policy.
+        agent: one of `BASELINES`, see `make_baseline`; or a policy: its file, the folder of its training, or its name.
         seed: seed of the random agent.
 
     Raises:

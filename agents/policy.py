@@ -18,13 +18,13 @@ from softgym_envs.storage import atomic_write, hash_of, read_json, write_json
 
 FORMAT = 1
 
-POLICY_FILE = "a policy file (.safetensors)"
+POLICY_FILE = "the folder of a training, a policy file (.safetensors)"
 """What may be given instead of the name of a shipped policy, for messages."""
 _SHIPPED = Path(__file__).parent / "weights"
 
 
 def policy_path(policy: str | Path) -> Path:
-    """Return the file of a policy, given its path or the name of a policy in ``agents/weights``.
+    """Return the file of a policy, given its path, the folder of its training, or its name in ``agents/weights``.
 
     Raises:
         WeightsError: if there is no such file or shipped policy.
@@ -34,9 +34,10 @@ def policy_path(policy: str | Path) -> Path:
         if not path.is_file():
             raise WeightsError(f"policy '{path}' does not exist; train one with 'softgym train'")
         return path
-    if str(policy) not in shipped_policies():
+    folder = _SHIPPED / path if str(policy) in shipped_policies() else path
+    if not (folder / "policy.safetensors").is_file():
         raise WeightsError(unknown_name("policy", str(policy), shipped_policies(), other=POLICY_FILE))
-    return _SHIPPED / str(policy) / "policy.safetensors"
+    return folder / "policy.safetensors"
 
 
 def shipped_policies() -> list[str]:

@@ -16,6 +16,7 @@ from softgym_envs.agents.evaluation import Evaluation, evaluate, evaluation_set
 from softgym_envs.agents.learners import LEARNERS
 from softgym_envs.agents.learners.base import Learner, Tensors
 from softgym_envs.agents.policy import Policy, read_tensors, save_policy
+from softgym_envs.envs.parallel import cpu_seconds
 from softgym_envs.errors import DataError, WeightsError
 from softgym_envs.extras import require
 from softgym_envs.runs import RunFolder, provenance
@@ -224,7 +225,7 @@ class _Run:
     """
 
     def __init__(self, config: TrainConfig, folder: Path, proposer: DesignProposer | None) -> None:
-        self._began = time.process_time()
+        self._began = cpu_seconds()
         self._config, self._folder, self._proposer = config, folder, proposer
         self._checkpoint = folder / CHECKPOINT
         self._curve: list[CurvePoint] = []
@@ -246,7 +247,7 @@ class _Run:
 
     @property
     def _cpu_seconds(self) -> float:
-        return time.process_time() - self._began
+        return cpu_seconds() - self._began
 
     def learn(self, tick: Callable[[int], object]) -> None:
         """Learn until the next evaluation is due."""
@@ -254,9 +255,9 @@ class _Run:
         if self._proposer is not None:
             self._proposer.begin(_model(learner))
         target = min(config.steps, (learner.step // config.report_every + 1) * config.report_every)
-        cpu = time.process_time()
+        cpu = cpu_seconds()
         learner.learn(target, tick)
-        self._learning_seconds += time.process_time() - cpu
+        self._learning_seconds += cpu_seconds() - cpu
 
     def evaluate(self) -> str:
         """Evaluate the present policy, keep the best one, and return the outcome as text."""
@@ -319,10 +320,10 @@ def cpu_before(policy: Path, began: float) -> float:
 
     Args:
         policy: return value of `train`.
-        began: ``time.process_time()`` before the call of `train`.
+        began: ``cpu_seconds()`` before the call of `train`.
     """
     card = read_json(policy.with_suffix(".json"))
-    return max(0.0, card.get("cpu_seconds", 0.0) - (time.process_time() - began))
+    return max(0.0, card.get("cpu_seconds", 0.0) - (cpu_seconds() - began))
 
 
 def _model(learner: Learner) -> SAC:

@@ -49,7 +49,8 @@ class StudyConfig(StudyProblem):
         strategy: how bodies are scored. ``"policy"``: by one shared policy. ``"warm_start"``: each trial
             fine-tunes that policy. ``"scratch"``: each trial trains a policy (plain nesting). ``"qp"``: by the
             inverse QP, without training.
-        policy: shared policy, for ``"policy"`` and ``"warm_start"``: a file or the name of a shipped one.
+        policy: shared policy, for ``"policy"`` and ``"warm_start"``: a file, the folder of a
+            training or the name of a shipped one.
         trials: number of bodies, the baseline and those of the screen included.
         workers: number of workers with one thread each.
         executor: what workers are: ``"processes"`` of this machine, or tasks of a ``"ray"`` cluster.

@@ -11,11 +11,12 @@ import numpy as np
 
 from softgym_envs.codesign.metrics.metric import Metric
 from softgym_envs.codesign.records import Score
+from softgym_envs.envs.parallel import cpu_seconds
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 
 
 @contextmanager
-def scoring(score: Score, clock: Callable[[], float] = time.process_time) -> Iterator[None]:
+def scoring(score: Score, clock: Callable[[], float] = cpu_seconds) -> Iterator[None]:
     """Add the time of a block to a score; a body that cannot exist or be simulated gets a reason instead of scores.
 
     Only `InfeasibleDesign`, `ConvergenceError` and scores that are not finite make a body infeasible; other exceptions

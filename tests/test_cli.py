@@ -255,8 +255,11 @@ def test_a_finished_training_is_extended_and_its_folder_is_named(softgym, monkey
     assert [line.split(",")[0] for line in lines] == ["step", "256", "512"]
     _, _, err = softgym("codesign", "--config", "finger_reach", "--folder", "run")
     assert "run' does not hold a co-design study: config" in err and "missing required keys name" in err
-    _, _, err = softgym("evaluate", "--config", "finger_reach_analytic", "--agent", "run")
-    assert "agent 'run' is the folder of a training; its policy is run/policy.safetensors" in err
+    told = [softgym("evaluate", "--agent", agent, "--goals", "2") for agent in ("run", "run/policy.safetensors")]
+    assert told[0][0] == 0 and told[0][1].split()[-6:] == told[1][1].split()[-6:]
+    assert softgym("rollout", "--agent", "run")[0] == 0
+    _, _, err = softgym("evaluate", "--config", "finger_reach_analytic", "--agent", ".")
+    assert "unknown agent '.'; " in err and "the folder of a training" in err
     _, _, err = softgym("evaluate", "--config", "./run", "--agent", "qp")
     assert "it is a folder; its file is run/config.yaml" in err
 

@@ -194,7 +194,7 @@ MISTAKES = {
     # Names
     "agent": (
         lambda _: evaluate("qpp", ENVIRONMENT, GOALS),
-        "unknown agent 'qpp'; did you mean 'qp'? allowed too: a policy file (.safetensors)",
+        "unknown agent 'qpp'; did you mean 'qp'? allowed too: the folder of a training, a policy file (.safetensors)",
     ),
     "robot": (
         lambda _: make_robot("fingr"),

@@ -19,6 +19,7 @@ from softgym_envs.codesign.phases.shared_policy import shared_policy
 from softgym_envs.codesign.problem import StudyProblem
 from softgym_envs.codesign.records import Assessment, Score, TrialResult
 from softgym_envs.codesign.scoring import scoring
+from softgym_envs.envs.parallel import cpu_seconds
 from softgym_envs.storage import read_json
 from softgym_envs.wording import counted
 
@@ -189,7 +190,7 @@ class _Runner:
         """Train the policy of the body; None if the pruner stopped the training."""
         config, result = self.config, self.result
         reporter = _Reporter(self.trial, config.primary, result, self.environment, prunable=self.prunable)
-        cpu = time.process_time()
+        cpu = cpu_seconds()
         policy = train(
             body_training(self.folder, result.design, result.options),
             self.folder.trial(result.number),

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 @click.command()
 @options.run_options("agents")
 @options.folder
-@click.option("--initial", type=options.PATH, help="Policy file to start from.")
+@click.option("--initial", type=options.PATH, help="Policy to start from: a file, or the folder of a training.")
 def train(config: Path, folder: Path, initial: Path | None, quiet: bool, overrides: tuple[str, ...]) -> dict[str, str]:
     """Train a policy with the learner that the configuration names.
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import time
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
+from weakref import WeakSet
 
 import gymnasium
 import numpy as np
@@ -75,6 +77,9 @@ class ParallelVectorEnv(AsyncVectorEnv):
         DesignError: for a malformed design.
     """
 
+    _open: ClassVar[WeakSet[ParallelVectorEnv]] = WeakSet()
+    _closed_seconds: ClassVar[float] = 0.0
+
     def __init__(
         self,
         robot: RobotSource | None = None,
@@ -95,6 +100,23 @@ class ParallelVectorEnv(AsyncVectorEnv):
             context="fork" if "fork" in multiprocessing.get_all_start_methods() else None,
             autoreset_mode=mode,
         )
+        self._open.add(self)
+
+    @classmethod
+    def seconds_of_all(cls) -> float:
+        """Return the CPU time [s] of the processes of all environments of this process, open and closed."""
+        return cls._closed_seconds + sum(env._seconds() for env in list(cls._open))
+
+    def _seconds(self) -> float:
+        """Return the CPU time of the processes so far [s]; 0 while one owes an answer, as after Ctrl-C."""
+        return sum(self.call("process_seconds")) if self._state is AsyncState.DEFAULT else 0.0
+
+    def close_extras(self, timeout: int | float | None = None, terminate: bool = False) -> None:
+        """Close the processes. The time of those that are terminated is not known."""
+        if not terminate:
+            ParallelVectorEnv._closed_seconds += self._seconds()
+        self._open.discard(self)
+        super().close_extras(timeout, terminate)
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: Mapping[str, Any] | None = None
@@ -129,6 +151,11 @@ class ParallelVectorEnv(AsyncVectorEnv):
             raise error
 
 
+def cpu_seconds() -> float:
+    """Return the CPU time [s] of this process so far, with that of its environments in processes of their own."""
+    return time.process_time() + ParallelVectorEnv.seconds_of_all()
+
+
 def _options_by_row(options: Mapping[str, Any]) -> list[str]:
     """Return the names of options of `reset` that hold a value for each sub-environment."""
     design, goal = options.get("design"), options.get("goal")
@@ -140,11 +167,15 @@ def _options_by_row(options: Mapping[str, Any]) -> list[str]:
 
 
 class _OwnOptions(gymnasium.Wrapper):
-    """Takes the body and the goals of one sub-environment from the options of all."""
+    """Takes the body and the goals of one sub-environment from the options of all, and knows its process's time."""
 
     def __init__(self, env: gymnasium.Env, index: int) -> None:
         super().__init__(env)
         self._index = index
+
+    def process_seconds(self) -> float:
+        """Return the CPU time of this process so far [s]."""
+        return time.process_time()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         own = dict(options or {})

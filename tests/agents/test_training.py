@@ -2,6 +2,7 @@
 
 import csv
 import json
+import resource
 import time
 from dataclasses import replace
 
@@ -17,8 +18,9 @@ from softgym_envs.agents.learners.sac import SACLearner
 from softgym_envs.agents.policy import Policy
 from softgym_envs.agents.training import train
 from softgym_envs.config import load_config, shipped_configs
+from softgym_envs.envs.parallel import cpu_seconds
 from softgym_envs.errors import ConfigError, DataError, WeightsError
-from softgym_envs.storage import write_signed
+from softgym_envs.storage import read_json, write_signed
 from tests.agents.interruption import interrupted_at
 
 CONFIG = TrainConfig.model_validate(
@@ -477,3 +479,18 @@ def test_the_best_policy_survives_an_interruption(tmp_path, monkeypatch):
     assert card["best_step"] == 200 and card["steps"] == 600 and len(seen) == 3
     assert all((kept[name] == value).all() for name, value in seen[0].items())
     assert any((kept[name] != value).any() for name, value in seen[2].items())
+
+
+def test_a_card_counts_the_time_of_the_processes_of_its_environments(tmp_path):
+    def of_children():
+        spent = resource.getrusage(resource.RUSAGE_CHILDREN)  # processes that have ended, as those of a training have
+        return spent.ru_utime + spent.ru_stime
+
+    environment = {"id": "SoftGym/TetrapodCarry-v0", "task_options": {"push": 1.0}, "robot_options": {"elements": 2}}
+    data = {"environment": environment, "learner": "ppo", "ppo": {"n_steps": 2, "batch_size": 2}, "num_envs": 2}
+    config = TrainConfig.model_validate({**data, "steps": 16, "evaluation_episodes": 1, "report_every": 16})
+    own, children, all_ = time.process_time(), of_children(), cpu_seconds()
+    card = read_json(train(config, tmp_path / "run", progress=False).with_suffix(".json"))
+    own, children, all_ = time.process_time() - own, of_children() - children, cpu_seconds() - all_
+    assert 0.0 < 0.5 * children < all_ - own < children  # what they spend on ending is not known
+    assert own < card["cpu_seconds"] < all_

@@ -6,6 +6,8 @@ import time
 
 from numba.core import event
 
+from softgym_envs.envs.parallel import cpu_seconds
+
 
 class _Compilations(event.Listener):
     """Adds up the CPU seconds in which this process compiles kernels, each with those that it needs."""
@@ -31,5 +33,5 @@ event.register("numba:compile", _COMPILATIONS)
 
 
 def working_seconds() -> float:
-    """Return the CPU seconds [s] of this process so far, without those of compilation."""
-    return time.process_time() - _COMPILATIONS.seconds
+    """Return the CPU seconds [s] of `cpu_seconds`, without those of compilation in this process."""
+    return cpu_seconds() - _COMPILATIONS.seconds
