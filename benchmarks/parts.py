@@ -11,7 +11,7 @@ from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.backends.parts import PartsBackend
 from softgym_envs.errors import ConvergenceError
-from softgym_envs.surrogate.parts.calibration import compare
+from softgym_envs.extensions.fitting.parts.calibration import compare
 from softgym_envs.surrogate.parts.weights import LearnedLeg
 
 BODIES, CORNERS, MOVING, SEED = 300, 60, 60, 2026

@@ -25,6 +25,7 @@ PACKAGES = {
     "softgym_envs.agents": "Agents",
     "softgym_envs.codesign": "Co-design",
     "softgym_envs.extensions.design": "Extension: design without a controller",
+    "softgym_envs.extensions.fitting": "Extension: fitting of surrogates",
     "softgym_envs.extensions.gpu": "Extension: environments on tensors",
     "softgym_envs.extensions.grasping": "Extension: grasping",
     "softgym_envs.extensions.hardware": "Extension: physical robots",

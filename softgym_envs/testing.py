@@ -286,10 +286,10 @@ def untrained_potential(
     """
     import torch
 
+    from softgym_envs.extensions.fitting.potential import stack_members
     from softgym_envs.surrogate.features import Features
     from softgym_envs.surrogate.potential.model import Model
     from softgym_envs.surrogate.potential.torch import PotentialNet
-    from softgym_envs.surrogate.potential.training import stack_members
 
     torch.manual_seed(seed)
     n, e = len(robot.actuators), 3 * len(robot.effectors)
@@ -319,7 +319,7 @@ def sample_states(
         limit: largest actuator displacement [m].
         sequence: name of a sampling sequence.
     """
-    from softgym_envs.surrogate.data.sampling import SamplingPlan, sample_group
+    from softgym_envs.extensions.fitting.data.sampling import SamplingPlan, sample_group
 
     full = robot.actuators
     robot.actuators = tuple(replace(actuator, high=limit) for actuator in full)
@@ -342,11 +342,11 @@ def train_small_surrogate(
     steps: int = 1500,
 ) -> None:
     """Train a surrogate of the baseline body on displacements up to ``limit`` [m] and write it to ``folder``."""
-    from softgym_envs.surrogate import potential
-    from softgym_envs.surrogate.data.states import training_states
+    from softgym_envs.extensions.fitting import potential
+    from softgym_envs.extensions.fitting.data.states import training_states
+    from softgym_envs.extensions.fitting.trainer import Trainer
+    from softgym_envs.extensions.fitting.training import domain_of
     from softgym_envs.surrogate.features import Features
-    from softgym_envs.surrogate.trainer import Trainer
-    from softgym_envs.surrogate.training import domain_of
     from softgym_envs.surrogate.weight_files import new_card, save_model
 
     training = sample_states(robot, states, 0, limit=limit, sequence="halton")

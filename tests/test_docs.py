@@ -20,8 +20,8 @@ from softgym_envs.envs.registration import ENVIRONMENTS
 from softgym_envs.envs.spaces import AgentSpaces
 from softgym_envs.envs.vector_env import SoftRobotVectorEnv
 from softgym_envs.errors import WeightsError
+from softgym_envs.extensions.fitting.training import FitConfig
 from softgym_envs.robots import ROBOTS
-from softgym_envs.surrogate.training import FitConfig
 from tests.accessibility import defects
 
 ROOT = Path(__file__).resolve().parent.parent

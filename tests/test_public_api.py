@@ -20,6 +20,7 @@ PACKAGES = [
     "softgym_envs.envs",
     "softgym_envs.extensions.deployment",
     "softgym_envs.extensions.design",
+    "softgym_envs.extensions.fitting",
     "softgym_envs.extensions.gpu",
     "softgym_envs.extensions.grasping",
     "softgym_envs.extensions.hardware",

@@ -22,6 +22,7 @@ from softgym_envs.config import load_config
 from softgym_envs.errors import SoftGymError
 from softgym_envs.extensions.design import measure
 from softgym_envs.extensions.design.config import CalibrationConfig, OptimiseConfig
+from softgym_envs.extensions.fitting.training import FitConfig
 from softgym_envs.extensions.sensing.loads import Payload, Touch, finger_grid
 from softgym_envs.extensions.sensing.readings import Noise
 from softgym_envs.mechanics import MechanicalModel
@@ -31,7 +32,6 @@ from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.robots import Actuator, Robot
 from softgym_envs.storage import cache_directory
-from softgym_envs.surrogate.training import FitConfig
 from softgym_envs.testing import box_mesh
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -36,12 +36,6 @@ SECTIONS = {
         "show": "robots:show",
         "check": "check:check",
     },
-    "Surrogates": {
-        "dataset": "surrogates:dataset",
-        "fit": "surrogates:fit",
-        "fit-inertia": "surrogates:fit_inertia",
-        "calibrate-trust": "surrogates:calibrate_trust",
-    },
     "Agents": {
         "train": "agents:train",
         "evaluate": "agents:evaluate",

@@ -1,4 +1,4 @@
-"""Learned condensed models: data, training, shipped weights and export."""
+"""Learned condensed models: inference, trust and shipped weights."""
 
 from typing import TYPE_CHECKING
 
@@ -8,8 +8,6 @@ if TYPE_CHECKING:
     from softgym_envs.surrogate.model import SurrogateModel as SurrogateModel
     from softgym_envs.surrogate.potential.torch import TorchModel as TorchModel
     from softgym_envs.surrogate.pretrained import pretrained_model as pretrained_model
-    from softgym_envs.surrogate.training import FitConfig as FitConfig
-    from softgym_envs.surrogate.training import fit as fit
 
 __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
@@ -17,6 +15,5 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "model": ["SurrogateModel"],
         "potential.torch": ["TorchModel"],
         "pretrained": ["pretrained_model"],
-        "training": ["FitConfig", "fit"],
     },
 )

@@ -14,7 +14,7 @@ from softgym_envs.runs import provenance
 from softgym_envs.storage import atomic_write, hash_of, read_json, write_json
 from softgym_envs.surrogate.identity import class_of, difference, fingerprint, is_shipped
 from softgym_envs.surrogate.model import SurrogateModel
-from softgym_envs.surrogate.networks import network_module
+from softgym_envs.surrogate.networks import NETWORKS
 
 FORMAT = 2
 
@@ -142,7 +142,7 @@ def load_model(folder: str | Path, robot: Robot, members: int | None = None) -> 
     card, tensors = read_weights(folder, robot)
     card_path, weights_path = Path(folder) / "model.json", Path(folder) / "model.safetensors"
     try:
-        module = network_module(str(card.get("network")))
+        module = NETWORKS.find(str(card.get("network")))
     except ValueError as error:
         raise WeightsError(f"'{card_path}': {error}") from None
     try:

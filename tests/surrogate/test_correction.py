@@ -11,12 +11,12 @@ import torch
 from softgym_envs import make_robot
 from softgym_envs.config import load_config, shipped_configs
 from softgym_envs.errors import DataError
+from softgym_envs.extensions.fitting.training import FitConfig
 from softgym_envs.extensions.gpu.surrogates import TorchBatch
 from softgym_envs.surrogate.correction import HIGHEST_ORDER, LOWEST_ORDER, EffortCorrection, fit_correction, order_of
 from softgym_envs.surrogate.potential.model import Model
 from softgym_envs.surrogate.potential.torch import TorchModel
 from softgym_envs.surrogate.pretrained import pretrained_folder
-from softgym_envs.surrogate.training import FitConfig
 from softgym_envs.testing import random_states, untrained_potential
 
 SIZES = (5.0, 3.0, 2.0)

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.linalg import eigh
 
 from softgym_envs.errors import WeightsError
+from softgym_envs.extensions.fitting.inertia_training import fit_inertia
 from softgym_envs.mechanics.solvers.reduction import reduce_motion
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.registry import make_robot
@@ -22,7 +23,6 @@ from softgym_envs.surrogate.inertia import (
     to_entries,
     write_inertia,
 )
-from softgym_envs.surrogate.inertia_training import fit_inertia
 from softgym_envs.surrogate.pretrained import pretrained_folder
 
 

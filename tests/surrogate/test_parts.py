@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 from softgym_envs import make_robot
 from softgym_envs.backends.parts import PartsBackend
 from softgym_envs.errors import WeightsError
+from softgym_envs.extensions.fitting.parts.held_leg import HeldLeg
 from softgym_envs.mechanics.elements.parts import PoseParts
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.surrogate.domain import SOFT
 from softgym_envs.surrogate.parts.energy import LegFunction
-from softgym_envs.surrogate.parts.held_leg import HeldLeg
 from softgym_envs.surrogate.parts.leg import VARIABLES, LegScale
 from softgym_envs.surrogate.parts.weights import LearnedLeg
 
@@ -34,7 +34,7 @@ def poses(count: int, seed: int = 0) -> np.ndarray:
 def function() -> LegFunction:
     import torch
 
-    from softgym_envs.surrogate.parts.network import LegNetwork
+    from softgym_envs.extensions.fitting.parts.network import LegNetwork
 
     torch.manual_seed(0)
     net = LegNetwork(16, 3)
@@ -55,7 +55,7 @@ def test_derivatives_are_those_of_differences(function):
 def test_torch_and_numpy_agree(function):
     import torch
 
-    from softgym_envs.surrogate.parts.network import ErrorNetwork, LegNetwork
+    from softgym_envs.extensions.fitting.parts.network import ErrorNetwork, LegNetwork
 
     torch.manual_seed(0)
     net = LegNetwork(16, 3)

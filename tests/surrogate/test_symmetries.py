@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from softgym_envs import make_robot
+from softgym_envs.extensions.fitting.data.states import with_images
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.surrogate.data.states import with_images
 
 ROBOTS = {
     "finger": ({"mesh": "accurate", "mesh_size": 0.03, "self_contact": False}, [0.004, 0.008]),

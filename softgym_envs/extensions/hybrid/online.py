@@ -36,14 +36,14 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.errors import DataError, WeightsError
+from softgym_envs.extensions.fitting.data.dataset import COLUMNS
+from softgym_envs.extensions.fitting.data.states import GROWTH, States, stable_rows, training_states
+from softgym_envs.extensions.fitting.potential import make_targets, potential_loss, stack_members, unstack_members
 from softgym_envs.extras import require
 from softgym_envs.robots.base import Robot
 from softgym_envs.storage import atomic_write, read_json, read_npz, write_json
-from softgym_envs.surrogate.data.dataset import COLUMNS
-from softgym_envs.surrogate.data.states import GROWTH, States, stable_rows, training_states
 from softgym_envs.surrogate.model import SurrogateModel
 from softgym_envs.surrogate.potential.model import Model
-from softgym_envs.surrogate.potential.training import make_targets, potential_loss, stack_members, unstack_members
 
 #: One in this many new states is withheld from all members and used to check them.
 WITHHELD_EVERY = 8
@@ -93,7 +93,7 @@ class StateStore:
         folder: folder of the shards; existing ones are read. None keeps states in memory only.
 
     Attributes:
-        data: all states, as columns of `softgym_envs.surrogate.data.dataset.COLUMNS`, in the order of the shards.
+        data: all states, as columns of `COLUMNS` of the extension `fitting`, in the order of the shards.
         count: number of states, without those at rest.
 
     Raises:

@@ -6,7 +6,7 @@ from abc import abstractmethod
 
 import numpy as np
 
-from softgym_envs.surrogate.data.states import full_compliance
+from softgym_envs.extensions.fitting.data.states import full_compliance
 from softgym_envs.surrogate.model import Context, SurrogateModel
 
 

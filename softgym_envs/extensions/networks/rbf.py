@@ -13,12 +13,12 @@ import numpy as np
 from pydantic import Field
 
 from softgym_envs.config import Config
+from softgym_envs.extensions.fitting.data.states import States
+from softgym_envs.extensions.fitting.trainer import History, Trainer
 from softgym_envs.extensions.networks.direct import DirectModel
 from softgym_envs.extensions.networks.perceptron import mean_scale, standardise
 from softgym_envs.robots.base import Robot
-from softgym_envs.surrogate.data.states import States
 from softgym_envs.surrogate.model import Context
-from softgym_envs.surrogate.trainer import History, Trainer
 
 Kernel = Literal["thin_plate_spline", "cubic", "quintic", "linear"]
 KERNELS = get_args(Kernel)

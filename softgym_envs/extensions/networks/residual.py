@@ -9,12 +9,12 @@ import numpy as np
 from pydantic import Field
 
 from softgym_envs.errors import DataError
+from softgym_envs.extensions.fitting.data.states import States
+from softgym_envs.extensions.fitting.trainer import History, Trainer, TrainingOptions
 from softgym_envs.extensions.networks.perceptron import layers, mean_scale, perceptron, standardise, weights
 from softgym_envs.mechanics.compilation import njit
 from softgym_envs.robots.base import Robot
-from softgym_envs.surrogate.data.states import States
 from softgym_envs.surrogate.model import Context, SurrogateModel
-from softgym_envs.surrogate.trainer import History, Trainer, TrainingOptions
 
 
 class Options(TrainingOptions):

@@ -8,12 +8,12 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
+from softgym_envs.extensions.fitting.data.states import States
+from softgym_envs.extensions.fitting.trainer import History, Trainer, TrainingOptions
 from softgym_envs.extensions.networks.direct import DirectModel
 from softgym_envs.extensions.networks.perceptron import layers, mean_scale, perceptron, standardise, weights
 from softgym_envs.robots.base import Robot
-from softgym_envs.surrogate.data.states import States
 from softgym_envs.surrogate.model import Context
-from softgym_envs.surrogate.trainer import History, Trainer, TrainingOptions
 
 
 class Options(TrainingOptions):

@@ -16,10 +16,10 @@ from softgym_envs import make_robot
 from softgym_envs.errors import DesignError
 from softgym_envs.extensions.deployment.surrogate_c import export_c
 from softgym_envs.extensions.deployment.surrogate_onnx import export_onnx
+from softgym_envs.extensions.fitting.potential import stack_members
 from softgym_envs.surrogate.features import Features
 from softgym_envs.surrogate.model import SurrogateModel
 from softgym_envs.surrogate.potential.model import Model
-from softgym_envs.surrogate.potential.training import stack_members
 from softgym_envs.surrogate.pretrained import pretrained_model
 from softgym_envs.testing import random_states
 

@@ -9,10 +9,10 @@ import pytest
 
 from softgym_envs import make_robot
 from softgym_envs.errors import DataError, WeightsError
+from softgym_envs.extensions.fitting.data.dataset import COLUMNS
+from softgym_envs.extensions.fitting.potential import stack_members, unstack_members
 from softgym_envs.extensions.hybrid.online import StateStore, check_ensemble, fine_tune, is_tuned_from, rehearsal_states
-from softgym_envs.surrogate.data.dataset import COLUMNS
 from softgym_envs.surrogate.potential.model import Model
-from softgym_envs.surrogate.potential.training import stack_members, unstack_members
 from softgym_envs.surrogate.pretrained import pretrained_model
 from softgym_envs.surrogate.weight_files import load_model, save_model
 from softgym_envs.testing import sample_states

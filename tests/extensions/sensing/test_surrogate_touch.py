@@ -12,8 +12,8 @@ from softgym_envs.agents.baselines import make_baseline
 from softgym_envs.backends.backend import PointForce
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.backends.surrogate import SurrogateBackend
+from softgym_envs.extensions.fitting.data.sampling import SamplingPlan, sample_group
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.surrogate.data.sampling import SamplingPlan, sample_group
 
 PUSH = PointForce(np.array([0.001, 0.0, -0.093]), np.array([0.0, 0.5, 0.0]))
 COMMAND = np.array([0.006])

@@ -18,15 +18,15 @@ import numpy as np
 from pydantic import Field
 
 from softgym_envs.executors import parallel_map
+from softgym_envs.extensions.fitting.data.states import full_compliance
+from softgym_envs.extensions.fitting.trainer import History, Trainer, TrainingOptions
+from softgym_envs.extensions.fitting.training import FitConfig, generate_datasets
 from softgym_envs.extensions.grasping.chain.body import FingerChain
 from softgym_envs.extensions.grasping.chain.closings import closing_errors, kept_closings, summary
 from softgym_envs.extensions.grasping.chain.model import ChainModel, depth_features, relative_stiffness, save_chain
 from softgym_envs.extensions.grasping.robots.grasping_hands import GraspingFinger
 from softgym_envs.robots.registry import make_robot
 from softgym_envs.storage import atomic_write
-from softgym_envs.surrogate.data.states import full_compliance
-from softgym_envs.surrogate.trainer import History, Trainer, TrainingOptions
-from softgym_envs.surrogate.training import FitConfig, generate_datasets
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -10,11 +10,9 @@ import torch
 from click.testing import CliRunner
 
 from softgym_envs import make_robot
-from softgym_envs.cli.surrogates import calibrate_trust
 from softgym_envs.errors import WeightsError
-from softgym_envs.extensions.gpu.surrogates import TorchBatch
-from softgym_envs.surrogate import calibration as module
-from softgym_envs.surrogate.calibration import (
+from softgym_envs.extensions.fitting import calibration as module
+from softgym_envs.extensions.fitting.calibration import (
     FACTOR_OF,
     Predictions,
     adversarial_search,
@@ -28,12 +26,14 @@ from softgym_envs.surrogate.calibration import (
     safe_limit,
     with_domain,
 )
-from softgym_envs.surrogate.data import strata
-from softgym_envs.surrogate.data.strata import StratifiedStates, draw_commands, strata_of
+from softgym_envs.extensions.fitting.cli import calibrate_trust
+from softgym_envs.extensions.fitting.data import strata
+from softgym_envs.extensions.fitting.data.strata import StratifiedStates, draw_commands, strata_of
+from softgym_envs.extensions.fitting.potential import stack_members, unstack_members
+from softgym_envs.extensions.gpu.surrogates import TorchBatch
 from softgym_envs.surrogate.domain import OUTSIDE, SOFT, SPREAD, Calibration, Domain, distrust_text
 from softgym_envs.surrogate.features import learned_variables
 from softgym_envs.surrogate.potential.model import Model
-from softgym_envs.surrogate.potential.training import stack_members, unstack_members
 from softgym_envs.surrogate.pretrained import pretrained_folder, pretrained_model, shipped_robots
 from softgym_envs.surrogate.weight_files import load_model, save_model
 from softgym_envs.testing import random_states

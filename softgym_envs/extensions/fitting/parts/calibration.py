@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
+from softgym_envs.extensions.fitting.calibration import conformal_quantile
+from softgym_envs.extensions.fitting.data.strata import draw_commands
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.solvers.equilibrium import Equilibrium
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import Robot
 from softgym_envs.storage import read_json, write_json
-from softgym_envs.surrogate.calibration import conformal_quantile
-from softgym_envs.surrogate.data.strata import draw_commands
 from softgym_envs.surrogate.domain import SOFT
 from softgym_envs.surrogate.parts.trust import Judged, judge
 from softgym_envs.surrogate.parts.weights import LearnedLeg
@@ -31,7 +31,7 @@ class Comparison:
     """States of bodies of learned parts beside those of finite elements, N states.
 
     Attributes:
-        stratum: as `surrogate.data.strata.DRAWN`, shape (N,).
+        stratum: as `strata.DRAWN`, shape (N,).
         design: shape (N, number of design variables).
         command: shape (N, n_a).
         error: distance of the first effector from that of finite elements [m], shape (N,).
@@ -99,7 +99,7 @@ def compare(robot: Robot, part: LearnedLeg, *, bodies: int, seed: int, strata: t
         part: the learned part.
         bodies: of each stratum.
         seed: of bodies and commands.
-        strata: see `surrogate.data.strata.DRAWN`.
+        strata: see `strata.DRAWN`.
     """
     learned, rows, lost, failed = robot.of_parts({"leg": part}), [], 0, 0
     held = np.ones(len(robot.actuators), dtype=bool)

@@ -6,8 +6,8 @@ import pytest
 
 from softgym_envs import make_robot
 from softgym_envs.errors import ConfigError
+from softgym_envs.extensions.fitting.training import FitConfig, account, generate_datasets
 from softgym_envs.robots.soft_finger import SoftFinger
-from softgym_envs.surrogate.training import FitConfig, account, generate_datasets
 
 SPLIT = {"groups": 2, "states": 2}
 PLANE = {"kind": "plane", "point": [0.0, 0.0, -0.2], "normal": [0.0, 0.0, 1.0]}

@@ -11,10 +11,10 @@ import numpy as np
 
 from softgym_envs.errors import DataError
 from softgym_envs.executors import parallel_map
+from softgym_envs.extensions.fitting.data.sampling import SamplingPlan, sample_group
 from softgym_envs.robots.base import Robot
 from softgym_envs.robots.registry import make_robot
 from softgym_envs.storage import atomic_write, read_json, read_npz, write_json
-from softgym_envs.surrogate.data.sampling import SamplingPlan, sample_group
 from softgym_envs.surrogate.identity import class_of, difference, fingerprint
 from softgym_envs.version import __version__
 from softgym_envs.wording import counted

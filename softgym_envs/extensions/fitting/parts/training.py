@@ -12,13 +12,13 @@ import numpy as np
 from pydantic import Field
 
 from softgym_envs.config import Config
+from softgym_envs.extensions.fitting.parts.data import LegStates, held_states, swing_poses
+from softgym_envs.extensions.fitting.trainer import Trainer, TrainingOptions
 from softgym_envs.extras import require
 from softgym_envs.runs import RunFolder
 from softgym_envs.storage import atomic_write
-from softgym_envs.surrogate.parts.data import LegStates, held_states, swing_poses
 from softgym_envs.surrogate.parts.pose import PLACE, TURN, WEIGHT
 from softgym_envs.surrogate.parts.weights import LegDomain, card_of_leg, write_leg
-from softgym_envs.surrogate.trainer import Trainer, TrainingOptions
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -183,7 +183,7 @@ def fit_part(
     require("train")
     import torch
 
-    from softgym_envs.surrogate.parts.network import ErrorNetwork, LegNetwork
+    from softgym_envs.extensions.fitting.parts.network import ErrorNetwork, LegNetwork
 
     folder = Path(folder)
     every = generate_part_data(config, data_folder)

@@ -28,10 +28,16 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.errors import WeightsError
+from softgym_envs.extensions.fitting.data.sampling import pushed
+from softgym_envs.extensions.fitting.data.strata import (
+    Commands,
+    StratifiedStates,
+    draw_commands,
+    solve_commands,
+    strata_of,
+)
 from softgym_envs.robots.base import Robot
 from softgym_envs.storage import write_json
-from softgym_envs.surrogate.data.sampling import pushed
-from softgym_envs.surrogate.data.strata import Commands, StratifiedStates, draw_commands, solve_commands, strata_of
 from softgym_envs.surrogate.domain import Calibration
 from softgym_envs.surrogate.features import learned_variables
 from softgym_envs.surrogate.model import SurrogateModel

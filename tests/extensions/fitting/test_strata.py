@@ -8,17 +8,17 @@ import pytest
 
 from softgym_envs import make_robot
 from softgym_envs.errors import ConvergenceError, DataError, InfeasibleDesign
-from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.surrogate.data import strata
-from softgym_envs.surrogate.data.dataset import generate_dataset
-from softgym_envs.surrogate.data.sampling import SamplingPlan, pushed
-from softgym_envs.surrogate.data.strata import (
+from softgym_envs.extensions.fitting.data import strata
+from softgym_envs.extensions.fitting.data.dataset import generate_dataset
+from softgym_envs.extensions.fitting.data.sampling import SamplingPlan, pushed
+from softgym_envs.extensions.fitting.data.strata import (
     Commands,
     StratifiedStates,
     draw_commands,
     solve_commands,
     strata_of,
 )
+from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.surrogate.features import learned_variables
 from softgym_envs.surrogate.pretrained import shipped_robots
 

@@ -18,24 +18,28 @@ from pydantic import Field, model_validator
 
 from softgym_envs.config import BesideConfig, Config
 from softgym_envs.errors import ConfigError
+from softgym_envs.extensions.fitting.data.dataset import generate_dataset, lost
+from softgym_envs.extensions.fitting.data.sampling import SamplingPlan
+from softgym_envs.extensions.fitting.data.states import full_compliance, stable_rows, training_states, with_images
+from softgym_envs.extensions.fitting.trainer import Trainer
 from softgym_envs.extras import require
 from softgym_envs.mechanics.condensation import effort_unit
+from softgym_envs.registry import Table
 from softgym_envs.robots.base import Robot
 from softgym_envs.robots.registry import make_robot
 from softgym_envs.runs import RunFolder
 from softgym_envs.storage import atomic_write
 from softgym_envs.surrogate.correction import fit_correction
-from softgym_envs.surrogate.data.dataset import generate_dataset, lost
-from softgym_envs.surrogate.data.sampling import SamplingPlan
-from softgym_envs.surrogate.data.states import full_compliance, stable_rows, training_states, with_images
 from softgym_envs.surrogate.domain import DISTRUST_REASONS
 from softgym_envs.surrogate.features import Features
 from softgym_envs.surrogate.model import SurrogateModel, definite
-from softgym_envs.surrogate.networks import NETWORKS, network_module
 from softgym_envs.surrogate.row_errors import RowErrors
-from softgym_envs.surrogate.trainer import Trainer
 from softgym_envs.surrogate.weight_files import load_model, new_card, save_model
 from softgym_envs.wording import counted
+
+NETWORKS = Table("network", {"potential": "softgym_envs.extensions.fitting.potential"}, group="softgym_envs.networks")
+"""Kind to module. Each module has ``Model`` (a `SurrogateModel`), ``Options`` (its hyper-parameters, a `Config` whose
+``kind`` is its key) and ``train(robot, training, validation, trainer) -> (tensors, histories)``."""
 
 SPLITS = ("train", "validation", "test")
 
@@ -155,13 +159,13 @@ if TYPE_CHECKING:
 else:
     #: Hyper-parameters of the network that ``kind`` names.
     NetworkOptions = Annotated[
-        functools.reduce(operator.or_, (network_module(kind).Options for kind in NETWORKS)),
+        functools.reduce(operator.or_, (NETWORKS.find(kind).Options for kind in NETWORKS)),
         Field(discriminator="kind"),
     ]
 
 
 class TrustConfig(Config):
-    """Calibration of the uncertainty after the training (`softgym_envs.surrogate.calibration`).
+    """Calibration of the uncertainty after the training (`softgym_envs.extensions.fitting.calibration`).
 
     Attributes:
         bodies: bodies of each stratum.
@@ -199,7 +203,7 @@ class FitConfig(Config):
     data: DataConfig
     pretraining: PretrainingConfig | None = None
     correction: CorrectionConfig | None = None
-    network: NetworkOptions = Field(default_factory=network_module("potential").Options)
+    network: NetworkOptions = Field(default_factory=NETWORKS.find("potential").Options)
     workers: int = Field(default=2, gt=0)
     executor: Literal["processes", "ray"] = "processes"
     seed: int = 0
@@ -465,7 +469,7 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
     learned = _learned(robot, data)
     states = {name: training_states(robot, columns, features) for name, columns in learned.items()}
     trained = _train(config, robot, states, folder / "parts", inputs, progress)
-    Model = network_module(config.network.kind).Model
+    Model = NETWORKS.find(config.network.kind).Model
     model = Model(robot, trained.tensors, {})
     errors = measure_errors(model, data["test"])
     # Cheap states are learned, too, and few expensive ones hardly reach the bounds of the boxes.
@@ -494,7 +498,7 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
     RunFolder(folder, FitConfig, "a fit").begin(config)
     load_model(folder, robot)  # fail now if the written files cannot be read
     if config.trust is not None:
-        from softgym_envs.surrogate.calibration import calibrate
+        from softgym_envs.extensions.fitting.calibration import calibrate
 
         options = config.trust.model_dump()
         calibrate(folder, robot, **options, state_folder=data_folder / "judged", workers=config.workers)
@@ -555,7 +559,7 @@ def _train(
     key = hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()[:12]
     trainer = Trainer(config.network, config.seed, parts, key, progress, config.workers)
     start = time.perf_counter()
-    module = network_module(config.network.kind)
+    module = NETWORKS.find(config.network.kind)
     first: dict[str, Any] = {}
     if config.pretraining is not None:
         options = config.network.model_copy(update={"steps": config.pretraining.steps})

@@ -16,11 +16,11 @@ import numpy as np
 
 from softgym_envs.errors import ConvergenceError, DataError, InfeasibleDesign
 from softgym_envs.executors import parallel_map
+from softgym_envs.extensions.fitting.data.sampling import solve_path, vertices
 from softgym_envs.mechanics.solvers.equilibrium import Equilibrium
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import Robot
 from softgym_envs.storage import atomic_write, read_npz
-from softgym_envs.surrogate.data.sampling import solve_path, vertices
 from softgym_envs.surrogate.features import learned_variables
 
 DRAWN = ("inside", "faces", "corners", "slack corners", "near buckling")

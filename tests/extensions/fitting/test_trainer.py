@@ -7,15 +7,15 @@ import pytest
 import torch
 
 from softgym_envs import make_robot
+from softgym_envs.extensions.fitting.calibration import reached
+from softgym_envs.extensions.fitting.data.states import States
+from softgym_envs.extensions.fitting.potential import make_targets, potential_loss, unstack_members
+from softgym_envs.extensions.fitting.trainer import Trainer
 from softgym_envs.extensions.networks import thesis
 from softgym_envs.extensions.networks.perceptron import perceptron
-from softgym_envs.surrogate.calibration import reached
-from softgym_envs.surrogate.data.states import States
 from softgym_envs.surrogate.potential.model import Model
 from softgym_envs.surrogate.potential.torch import PotentialNet
-from softgym_envs.surrogate.potential.training import make_targets, potential_loss, unstack_members
 from softgym_envs.surrogate.pretrained import pretrained_model
-from softgym_envs.surrogate.trainer import Trainer
 from softgym_envs.testing import random_states
 
 

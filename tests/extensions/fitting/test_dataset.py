@@ -18,11 +18,9 @@ from hypothesis import strategies as st
 
 from softgym_envs import make_robot
 from softgym_envs.errors import ConvergenceError, DataError, DesignError, InfeasibleDesign
-from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.robots import stiff_flop
-from softgym_envs.surrogate.data import dataset, sampling
-from softgym_envs.surrogate.data.dataset import COLUMNS, generate_dataset, load_dataset
-from softgym_envs.surrogate.data.sampling import (
+from softgym_envs.extensions.fitting.data import dataset, sampling
+from softgym_envs.extensions.fitting.data.dataset import COLUMNS, generate_dataset, load_dataset
+from softgym_envs.extensions.fitting.data.sampling import (
     SEQUENCES,
     SamplingPlan,
     may_be_joined,
@@ -31,6 +29,8 @@ from softgym_envs.surrogate.data.sampling import (
     select_states,
     solve_path,
 )
+from softgym_envs.mechanics.solvers.statics import Statics
+from softgym_envs.robots import stiff_flop
 from softgym_envs.surrogate.features import learned_variables
 from softgym_envs.testing import live_processes, wait_until
 
@@ -596,8 +596,8 @@ LONG = SamplingPlan(groups=200, states=2, sequence="random", seed=1)
 STARTER = f"""
 import os, sys
 import joblib.externals.loky.backend.resource_tracker
-from softgym_envs.surrogate.data.dataset import generate_dataset
-from softgym_envs.surrogate.data.sampling import SamplingPlan
+from softgym_envs.extensions.fitting.data.dataset import generate_dataset
+from softgym_envs.extensions.fitting.data.sampling import SamplingPlan
 
 for folder in sys.stdin:
     process = os.fork()

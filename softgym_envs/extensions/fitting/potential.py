@@ -1,4 +1,4 @@
-"""Training of the potential networks."""
+"""Training of the potential networks, with what the table of networks expects: ``Model``, ``Options``, ``train``."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ import numpy as np
 from pydantic import Field
 
 from softgym_envs.executors import parallel_map
+from softgym_envs.extensions.fitting.data.states import States
+from softgym_envs.extensions.fitting.trainer import History, Trainer, TrainingOptions
 from softgym_envs.robots.base import Robot
-from softgym_envs.surrogate.data.states import States
-from softgym_envs.surrogate.trainer import History, Trainer, TrainingOptions
+from softgym_envs.surrogate.potential.model import Model as Model
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -21,8 +21,8 @@ def dataset(config: Path, folder: Path, quiet: bool, overrides: tuple[str, ...])
     An interrupted run continues where it stopped.
     """
     from softgym_envs.config import load_config
-    from softgym_envs.surrogate.parts.training import PartConfig, generate_part_data
-    from softgym_envs.surrogate.training import FitConfig, generate_datasets
+    from softgym_envs.extensions.fitting.parts.training import PartConfig, generate_part_data
+    from softgym_envs.extensions.fitting.training import FitConfig, generate_datasets
 
     if _is_part(config):
         held = generate_part_data(load_config(config, PartConfig, overrides), folder)
@@ -46,11 +46,11 @@ def fit(config: Path, folder: Path, data: Path | None, quiet: bool, overrides: t
     stopped.
     """
     from softgym_envs.config import load_config
+    from softgym_envs.extensions.fitting.parts.training import PartConfig, fit_part
+    from softgym_envs.extensions.fitting.training import FitConfig, account
+    from softgym_envs.extensions.fitting.training import fit as run
     from softgym_envs.robots.registry import make_robot
     from softgym_envs.storage import read_json
-    from softgym_envs.surrogate.parts.training import PartConfig, fit_part
-    from softgym_envs.surrogate.training import FitConfig, account
-    from softgym_envs.surrogate.training import fit as run
 
     if _is_part(config):
         part = load_config(config, PartConfig, overrides)
@@ -113,11 +113,11 @@ def calibrate_trust(
     """
     from dataclasses import asdict
 
-    from softgym_envs.surrogate.calibration import calibrate
+    from softgym_envs.extensions.fitting.calibration import calibrate
 
     body = options.robot_of(robot, options_)
     if body.learning.parts:
-        from softgym_envs.surrogate.parts.calibration import calibrate_parts
+        from softgym_envs.extensions.fitting.parts.calibration import calibrate_parts
 
         found_of_parts = calibrate_parts(weights, body.learned_mesh(), bodies=bodies, seed=seed)
         click.echo(json.dumps(found_of_parts, indent=2))
@@ -146,8 +146,8 @@ def fit_inertia(
     Draws bodies, solves equilibria on FEM and reduces the mass of each body about them. The result is written beside
     the weights.
     """
+    from softgym_envs.extensions.fitting.inertia_training import fit_inertia as run
     from softgym_envs.surrogate.inertia import write_inertia
-    from softgym_envs.surrogate.inertia_training import fit_inertia as run
 
     body = options.robot_of(robot, options_)
     found = run(body, bodies=bodies, states=states, degree=degree, workers=workers, progress=True)

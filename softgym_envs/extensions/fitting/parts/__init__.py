@@ -1,0 +1,1 @@
+"""Fitting of learned parts (`softgym_envs.surrogate.parts`)."""
