@@ -1,6 +1,6 @@
 """Co-design: Optuna proposes bodies, each is scored with its controller, and the best are checked on FEM.
 
-`run_study` runs a study, `write_report` writes its report, and `load_study` reads what it has found so far.
+`run_study` runs a study, and `load_study` reads what it has found so far.
 """
 
 from typing import TYPE_CHECKING
@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from softgym_envs.codesign.metrics.metric import Metric as Metric
     from softgym_envs.codesign.metrics.metric import metric as metric
     from softgym_envs.codesign.metrics.sources import Outcome as Outcome
-    from softgym_envs.codesign.report.page import write_report as write_report
     from softgym_envs.codesign.snapshot import load_study as load_study
     from softgym_envs.codesign.study import run_study as run_study
 
@@ -25,7 +24,6 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "config": ["StudyConfig"],
         "metrics.metric": ["Metric", "metric"],
         "metrics.sources": ["Outcome"],
-        "report.page": ["write_report"],
         "snapshot": ["load_study"],
         "study": ["run_study"],
     },

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from softgym_envs.codesign.folder import StudyFolder
 from softgym_envs.codesign.records import REFINED, FinalistTest, TestGroup, TrialResult
-from softgym_envs.codesign.report.results import Comparison, StudyResults
+from softgym_envs.codesign.results import Comparison, StudyResults
 from softgym_envs.units import present
 from softgym_envs.wording import counted
 

@@ -23,8 +23,8 @@ from softgym_envs.codesign.phases.screen import kept_bodies, screen_jobs
 from softgym_envs.codesign.phases.shared_policy import shared_policy_jobs
 from softgym_envs.codesign.progress import Progress
 from softgym_envs.codesign.records import Account, Job
-from softgym_envs.codesign.report.files import write_results
-from softgym_envs.codesign.report.results import StudyResults
+from softgym_envs.codesign.result_files import write_results
+from softgym_envs.codesign.results import StudyResults
 from softgym_envs.codesign.sampling import make_sampler
 from softgym_envs.codesign.scheduling.jobs import missing_jobs
 from softgym_envs.codesign.scheduling.optuna_study import distributions, make_pruner

@@ -34,7 +34,7 @@ from softgym_envs.agents import TrainConfig, evaluate, train
 from softgym_envs.agents.evaluation import sample_goals
 from softgym_envs.backends import make_backend
 from softgym_envs.cli.app import cli
-from softgym_envs.codesign.report.page import SECTIONS
+from softgym_envs.extensions.report.page import SECTIONS
 from softgym_envs.codesign.sampling import SamplerConfig, make_sampler
 from softgym_envs.extensions.design.bodies import StateEvaluator
 from softgym_envs.surrogate import pretrained_model

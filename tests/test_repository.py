@@ -84,7 +84,7 @@ def test_workflows_name_the_system_packages_that_errors_name():
 def test_the_demonstration_is_the_shipped_study(softgym, monkeypatch, tmp_path):
     runs = []
     monkeypatch.setattr("softgym_envs.codesign.study.run_study", lambda *args, **options: runs.append((args, options)))
-    monkeypatch.setattr("softgym_envs.codesign.report.page.write_report", lambda folder: folder / "report.html")
+    monkeypatch.setattr("softgym_envs.extensions.report.page.write_report", lambda folder: folder / "report.html")
     status, out, _ = softgym("demo", "--folder", tmp_path, "--workers", "1", "--quiet")
     assert (status, out) == (0, f"report: {tmp_path / 'report.html'}\n")
     (((config, folder), options),) = runs

@@ -52,7 +52,8 @@ def test_texts_of_studies_count_with_their_helper():
     """A count before a plural noun in an f-string is right for every number but one."""
     nouns = "goals|bodies|trials|tests|finalists|policies|designs|workers|episodes|winners"
     found = []
-    for path in sorted([*(ROOT / "codesign/report").rglob("*.py"), *(ROOT / "softgym_envs/cli").rglob("*.py")]):
+    folders = ROOT / "softgym_envs/extensions/report", ROOT / "softgym_envs/cli"
+    for path in sorted(file for folder in folders for file in folder.rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.JoinedStr):
                 for value, text in zip(node.values, node.values[1:], strict=False):

@@ -34,7 +34,6 @@ SECTIONS = {
     },
     "Robots": {
         "show": "robots:show",
-        "check": "check:check",
     },
     "Agents": {
         "train": "agents:train",

@@ -29,7 +29,7 @@ def codesign(
     """
     require("codesign")
     from softgym_envs.codesign.config import StudyConfig
-    from softgym_envs.codesign.report.page import write_report
+    from softgym_envs.codesign.result_files import REPORTS
     from softgym_envs.codesign.study import run_study
     from softgym_envs.config import load_config
 
@@ -39,6 +39,7 @@ def codesign(
         run_study(study, folder, workers=workers, progress=not quiet)
         if not quiet:
             click.echo("drawing the report: finite elements compute what baseline and winner do at one goal")
-        report = write_report(folder)
-    click.echo(f"report: {report}")
-    return {"folder": str(folder), "report": str(report)}
+        reports = {name: str(write(folder)) for name, write in REPORTS.items()}
+    for name, path in reports.items():
+        click.echo(f"{name}: {path}")
+    return {"folder": str(folder), **reports}

@@ -9,11 +9,11 @@ import pytest
 
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.folder import StudyFolder
-from softgym_envs.codesign.report.files import write_results
-from softgym_envs.codesign.report.page import write_report
+from softgym_envs.codesign.result_files import write_results
 from softgym_envs.codesign.snapshot import load_study
 from softgym_envs.codesign.study import run_study
 from softgym_envs.errors import SoftGymError
+from softgym_envs.extensions.report.page import write_report
 from softgym_envs.storage import write_signed
 
 TRIALS = 3

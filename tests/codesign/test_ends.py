@@ -10,21 +10,21 @@ import pytest
 from softgym_envs.agents.config import EnvironmentConfig
 from softgym_envs.agents.evaluation import Evaluation, evaluate
 from softgym_envs.backends.fem import FEMBackend
+from softgym_envs.codesign.collect import collect
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.folder import StudyFolder
 from softgym_envs.codesign.goals import Stratum, missed_first
 from softgym_envs.codesign.phases import ends
 from softgym_envs.codesign.phases.finalists import finalist_environment
 from softgym_envs.codesign.records import FinalistTest, TrialResult
-from softgym_envs.codesign.report.collect import collect
-from softgym_envs.codesign.report.episodes import MOMENTS, moments
-from softgym_envs.codesign.report.findings import findings
-from softgym_envs.codesign.report.page import write_report
-from softgym_envs.codesign.report.statistics import mesh_part
 from softgym_envs.codesign.snapshot import load_study
+from softgym_envs.codesign.statistics import mesh_part
 from softgym_envs.codesign.study import run_study
 from softgym_envs.control.settling import nearest_next
 from softgym_envs.errors import ConfigError, ConvergenceError
+from softgym_envs.extensions.report.episodes import MOMENTS, moments
+from softgym_envs.extensions.report.findings import findings
+from softgym_envs.extensions.report.page import write_report
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.testing import wait_until
 

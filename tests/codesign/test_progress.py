@@ -7,9 +7,9 @@ import pytest
 
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.progress import Countdown, duration
-from softgym_envs.codesign.report.findings import findings
 from softgym_envs.codesign.snapshot import load_study
 from softgym_envs.codesign.study import run_study
+from softgym_envs.extensions.report.findings import findings
 from softgym_envs.storage import write_signed
 from softgym_envs.version import __version__
 

@@ -9,14 +9,14 @@ import pytest
 from PIL import Image, ImageSequence
 
 from softgym_envs.agents.evaluation import Evaluation
+from softgym_envs.codesign.collect import collect
 from softgym_envs.codesign.records import FinalistTest, TrialResult
-from softgym_envs.codesign.report.collect import collect
-from softgym_envs.codesign.report.episodes import typical_goal
-from softgym_envs.codesign.report.figures import search_figures
-from softgym_envs.codesign.report.findings import findings
-from softgym_envs.codesign.report.motion import goal_outcomes, goal_views
-from softgym_envs.codesign.report.tables import effort_rows
 from softgym_envs.codesign.snapshot import load_study
+from softgym_envs.extensions.report.episodes import typical_goal
+from softgym_envs.extensions.report.figures import search_figures
+from softgym_envs.extensions.report.findings import findings
+from softgym_envs.extensions.report.motion import goal_outcomes, goal_views
+from softgym_envs.extensions.report.tables import effort_rows
 from softgym_envs.viewer.video import write_video
 from softgym_envs.wording import time_text
 

@@ -16,7 +16,7 @@ from optuna.trial import TrialState
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.folder import StudyFolder
 from softgym_envs.codesign.phases.trial import give_up
-from softgym_envs.codesign.report.files import write_results
+from softgym_envs.codesign.result_files import write_results
 from softgym_envs.codesign.scheduling import worker
 from softgym_envs.codesign.scheduling.optuna_study import open_study
 from softgym_envs.codesign.scheduling.processes import WorkerError, run_workers

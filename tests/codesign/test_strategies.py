@@ -19,11 +19,11 @@ from softgym_envs.codesign.folder import SHARED_POLICY, StudyFolder
 from softgym_envs.codesign.phases.finalists import _trained_policy
 from softgym_envs.codesign.phases.trial import body_training
 from softgym_envs.codesign.records import Finalist, FinalistTest
-from softgym_envs.codesign.report.page import write_report
-from softgym_envs.codesign.report.statistics import kendall_tau
 from softgym_envs.codesign.scheduling.optuna_study import open_study
 from softgym_envs.codesign.snapshot import load_study
+from softgym_envs.codesign.statistics import kendall_tau
 from softgym_envs.codesign.study import run_study
+from softgym_envs.extensions.report.page import write_report
 from softgym_envs.runs import RunFolder
 
 SHOWN = {"id": "SoftGym/FingerReach-v0", "design_in_observation": ["length", "height", "joint_height"]}
@@ -204,7 +204,7 @@ def test_report_opens_in_a_browser(run, tmp_path, require_program):
 
 def test_every_strategy_is_described():
     from softgym_envs.codesign.parts import STRATEGIES
-    from softgym_envs.codesign.report.sentences import CONTROLLERS
+    from softgym_envs.extensions.report.sentences import CONTROLLERS
 
     assert set(CONTROLLERS) == set(STRATEGIES)
 

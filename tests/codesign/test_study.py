@@ -18,13 +18,13 @@ from softgym_envs.agents.evaluation import Evaluation
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.folder import SHARED_POLICY, SHARED_POLICY_RECORD, StudyFolder
 from softgym_envs.codesign.records import FinalistTest, SharedPolicy, TrialResult
-from softgym_envs.codesign.report.page import write_report
-from softgym_envs.codesign.report.statistics import kendall_tau, mean_interval, rank_correlation, rate_interval
 from softgym_envs.codesign.scheduling.optuna_study import open_study
 from softgym_envs.codesign.scheduling.queue import TrialQueue
 from softgym_envs.codesign.snapshot import load_study
+from softgym_envs.codesign.statistics import kendall_tau, mean_interval, rank_correlation, rate_interval
 from softgym_envs.codesign.study import run_study
 from softgym_envs.errors import WeightsError
+from softgym_envs.extensions.report.page import write_report
 from softgym_envs.testing import wait_until
 from tests.accessibility import defects
 

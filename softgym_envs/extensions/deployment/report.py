@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from softgym_envs.codesign.report.exports import Winner, WinnerFile
 from softgym_envs.extensions.deployment.cad import export_body
 from softgym_envs.extensions.deployment.policy_onnx import export_policy_onnx
+from softgym_envs.extensions.report.exports import Winner, WinnerFile
 
 
 def _write_body(path: Path, winner: Winner) -> None:

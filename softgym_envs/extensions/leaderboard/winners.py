@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from softgym_envs.codesign.records import Record
-from softgym_envs.codesign.report.statistics import kendall_tau
+from softgym_envs.codesign.statistics import kendall_tau
 from softgym_envs.extensions.leaderboard.frozen import FrozenProblem, load_problem, problem_names
 from softgym_envs.extensions.leaderboard.runs import Run, stored_runs, tested
 from softgym_envs.extensions.leaderboard.scoring import DATA

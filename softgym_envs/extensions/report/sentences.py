@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from softgym_envs.codesign.collect import FEW_GOALS
 from softgym_envs.codesign.metrics.metric import Metric
-from softgym_envs.codesign.report.collect import FEW_GOALS
-from softgym_envs.codesign.report.episodes import Episode
-from softgym_envs.codesign.report.results import Comparison, StudyResults
-from softgym_envs.codesign.report.statistics import MIN_GOALS, MeshPart, kendall_tau, rank_correlation
-from softgym_envs.codesign.report.tables import BACKENDS, SHOWN_ALWAYS, percent
+from softgym_envs.codesign.results import Comparison, StudyResults
 from softgym_envs.codesign.snapshot import StudySnapshot
+from softgym_envs.codesign.statistics import MIN_GOALS, MeshPart, kendall_tau, rank_correlation
+from softgym_envs.extensions.report.episodes import Episode
+from softgym_envs.extensions.report.tables import BACKENDS, SHOWN_ALWAYS, percent
 from softgym_envs.units import present
 from softgym_envs.wording import counted, decimal, time_text
 

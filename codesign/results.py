@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.codesign.records import Finalist, FinalistTraining, Record, TestGroup
-from softgym_envs.codesign.report.statistics import Interval, MeshPart
+from softgym_envs.codesign.statistics import Interval, MeshPart
 
 LIMIT_MARGIN = 0.02
 """A variable this close to an end of its range, as a fraction of the range, is at its limit."""

@@ -14,7 +14,7 @@ from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.phases.ends import episode_commands
 from softgym_envs.codesign.phases.finalists import finalist_environment, policy_file
 from softgym_envs.codesign.records import Finalist
-from softgym_envs.codesign.report.results import StudyResults
+from softgym_envs.codesign.results import StudyResults
 from softgym_envs.codesign.snapshot import StudySnapshot
 from softgym_envs.envs.tasks.base import Task
 from softgym_envs.executors import parallel_map

@@ -29,7 +29,7 @@ def check(
     Builds its bodies, solves for random commands, compares meshes and efforts, and says what to do about each finding.
     Ends with status 1 if there is a fault.
     """
-    from softgym_envs.backends.checkup import check_robot
+    from softgym_envs.extensions.checks.checkup import check_robot
 
     body = options.robot_of(robot, options_)
 

@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING
 import yaml
 from markupsafe import Markup
 
-from softgym_envs.codesign.report import figures, motion, sentences, tables
-from softgym_envs.codesign.report.episodes import Episode, run_episodes
-from softgym_envs.codesign.report.exports import Download, write_exports
-from softgym_envs.codesign.report.files import write_results
-from softgym_envs.codesign.report.findings import Finding, findings
-from softgym_envs.codesign.report.pictures import BodyPictures, body_pictures
-from softgym_envs.codesign.report.results import StudyResults
-from softgym_envs.codesign.report.sentences import KeyFigure
+from softgym_envs.codesign.result_files import write_results
+from softgym_envs.codesign.results import StudyResults
 from softgym_envs.codesign.snapshot import StudySnapshot, load_study
 from softgym_envs.errors import SoftGymError
+from softgym_envs.extensions.report import figures, motion, sentences, tables
+from softgym_envs.extensions.report.episodes import Episode, run_episodes
+from softgym_envs.extensions.report.exports import Download, write_exports
+from softgym_envs.extensions.report.findings import Finding, findings
+from softgym_envs.extensions.report.pictures import BodyPictures, body_pictures
+from softgym_envs.extensions.report.sentences import KeyFigure
 from softgym_envs.registry import Table
 from softgym_envs.storage import atomic_write
 from softgym_envs.wording import counted

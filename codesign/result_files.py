@@ -8,12 +8,16 @@ from pathlib import Path
 from typing import Any
 
 from softgym_envs.agents.evaluation import Evaluation, none_for_nan
+from softgym_envs.codesign.collect import collect
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.records import Finalist, TestGroup, TrialResult
-from softgym_envs.codesign.report.collect import collect
-from softgym_envs.codesign.report.results import StudyResults
+from softgym_envs.codesign.results import StudyResults
 from softgym_envs.codesign.snapshot import StudySnapshot
+from softgym_envs.registry import Table
 from softgym_envs.storage import atomic_write
+
+REPORTS = Table("report of a study", {}, group="softgym_envs.reports")
+"""Reports of installed packages by name: each takes the folder of a study and returns the path of what it wrote."""
 
 
 def write_results(snapshot: StudySnapshot) -> StudyResults:

@@ -9,9 +9,9 @@ from functools import partial
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.metrics.metric import Metric
 from softgym_envs.codesign.records import REFINED, TrialResult
-from softgym_envs.codesign.report.results import Comparison, Cost, StudyResults, Transfer, VariableResult
-from softgym_envs.codesign.report.statistics import MeshPart
+from softgym_envs.codesign.results import Comparison, Cost, StudyResults, Transfer, VariableResult
 from softgym_envs.codesign.snapshot import StudySnapshot
+from softgym_envs.codesign.statistics import MeshPart
 from softgym_envs.units import display, present
 from softgym_envs.wording import decimal, time_text
 

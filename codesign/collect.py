@@ -13,7 +13,7 @@ from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.goals import Stratum
 from softgym_envs.codesign.metrics.metric import Metric
 from softgym_envs.codesign.records import REFINED, Finalist, TestGroup
-from softgym_envs.codesign.report.results import (
+from softgym_envs.codesign.results import (
     BodyStatistics,
     Comparison,
     Cost,
@@ -21,7 +21,8 @@ from softgym_envs.codesign.report.results import (
     Transfer,
     VariableResult,
 )
-from softgym_envs.codesign.report.statistics import (
+from softgym_envs.codesign.snapshot import StudySnapshot
+from softgym_envs.codesign.statistics import (
     Interval,
     MeshPart,
     mean_interval,
@@ -29,7 +30,6 @@ from softgym_envs.codesign.report.statistics import (
     rank_correlation,
     rate_interval,
 )
-from softgym_envs.codesign.snapshot import StudySnapshot
 from softgym_envs.wording import counted
 
 FEW_GOALS = 10

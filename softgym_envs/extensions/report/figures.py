@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softgym_envs.codesign.records import TrialResult
-from softgym_envs.codesign.report.results import StudyResults
+from softgym_envs.codesign.results import StudyResults
 from softgym_envs.codesign.snapshot import StudySnapshot
 from softgym_envs.units import display
 

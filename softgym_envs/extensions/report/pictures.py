@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from softgym_envs.codesign.report.results import StudyResults
+from softgym_envs.codesign.results import StudyResults
 from softgym_envs.codesign.snapshot import StudySnapshot
 from softgym_envs.robots.base import Robot
 

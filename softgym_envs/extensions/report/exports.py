@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from softgym_envs.codesign.phases.finalists import policy_file
-from softgym_envs.codesign.report.episodes import Episode
-from softgym_envs.codesign.report.results import StudyResults
+from softgym_envs.codesign.results import StudyResults
 from softgym_envs.codesign.snapshot import StudySnapshot
 from softgym_envs.errors import SoftGymError
+from softgym_envs.extensions.report.episodes import Episode
 from softgym_envs.registry import Table
 from softgym_envs.robots.base import Robot
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from softgym_envs.codesign.records import REFINED
-from softgym_envs.codesign.report.results import StudyResults
-from softgym_envs.codesign.report.statistics import MIN_GOALS, mean_interval
+from softgym_envs.codesign.results import StudyResults
 from softgym_envs.codesign.snapshot import StudySnapshot
+from softgym_envs.codesign.statistics import MIN_GOALS, mean_interval
 from softgym_envs.units import present
 from softgym_envs.wording import counted
 

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from softgym_envs.codesign.report.episodes import Episode
-from softgym_envs.codesign.report.figures import BASELINE, COLOURS, VIOLATES, WINNER, blank
-from softgym_envs.codesign.report.results import StudyResults
+from softgym_envs.codesign.results import StudyResults
 from softgym_envs.codesign.snapshot import StudySnapshot
+from softgym_envs.extensions.report.episodes import Episode
+from softgym_envs.extensions.report.figures import BASELINE, COLOURS, VIOLATES, WINNER, blank
 from softgym_envs.wording import decimal
 
 if TYPE_CHECKING:

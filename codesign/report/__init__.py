@@ -1,1 +1,0 @@
-"""Results of a study: records, tables, plots, the HTML report and exported files."""

@@ -1,0 +1,1 @@
+"""Examination of a robot before work is spent on it: `softgym check`."""
