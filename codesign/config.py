@@ -53,7 +53,6 @@ class StudyConfig(StudyProblem):
             training or the name of a shipped one.
         trials: number of bodies, the baseline and those of the screen included.
         workers: number of workers with one thread each.
-        executor: what workers are: ``"processes"`` of this machine, or tasks of a ``"ray"`` cluster.
         storage: where trials are kept: the ``"journal"`` of the folder, for one machine, or a PostgreSQL database for
             many machines, ``postgresql://user@host:port/database``.
         heartbeat: time without a heartbeat after which a worker of a database counts as dead; another worker then runs
@@ -73,7 +72,6 @@ class StudyConfig(StudyProblem):
     policy: Annotated[str | None, BesideConfig()] = None
     trials: int = Field(ge=1)
     workers: int = Field(default=1, ge=1)
-    executor: Literal["processes", "ray"] = "processes"
     storage: str = JOURNAL
     heartbeat: float = Field(default=60.0, ge=1.0)
     patience: float = Field(default=600.0, ge=0.0)

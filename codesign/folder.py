@@ -19,7 +19,7 @@ from softgym_envs.runs import RunFolder, check_compatible
 from softgym_envs.storage import RESTORE, atomic_write, read_json, read_signed, write_json, write_signed
 
 EXTENSIBLE = (
-    *("name", "title", "trials", "workers", "executor", "heartbeat", "patience", "attempts"),
+    *("name", "title", "trials", "workers", "heartbeat", "patience", "attempts"),
     *("finalists.count", "finalists.choose", "finalists.seeds", "finalists.steps", "finalists.fem_options"),
     *("finalists.test", "finalists.last_steps", "finalists.refinement"),
 )

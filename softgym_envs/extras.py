@@ -13,7 +13,6 @@ EXTRAS = {
     "viewer": ("pyvista", "vtkmodules", "rerun", "PIL"),
     "video": ("imageio_ffmpeg",),
     "codesign": ("optuna", "cmaes", "jinja2", "markupsafe", "plotly"),
-    "ray": ("ray",),
     "postgres": ("psycopg", "sqlalchemy"),
     "onnx": ("onnx",),
     "minari": ("minari", "h5py", "jax"),

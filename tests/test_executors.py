@@ -1,4 +1,4 @@
-"""Parallel calls on processes and on Ray: results, errors, and no process left behind."""
+"""Parallel calls on processes: results, errors, and no process left behind."""
 
 import math
 import operator
@@ -9,16 +9,11 @@ import sys
 
 import pytest
 
-from softgym_envs.executors import EXECUTORS, parallel_map
+from softgym_envs.executors import parallel_map
 from softgym_envs.testing import live_processes, wait_until
 
 # Functions of the standard library: workers cannot import test files.
 SQUARES = [(k, k) for k in range(20)]
-
-
-def test_unknown_executor():
-    with pytest.raises(ValueError, match=r"'threads' is unknown; allowed: 'processes', 'ray'"):
-        list(parallel_map(operator.mul, SQUARES, 2, "threads"))
 
 
 @pytest.mark.parametrize("workers", [1, 2])
@@ -82,23 +77,3 @@ def test_ctrl_c_of_workers_with_progress_bars_is_quiet():
         finally:
             for left in live_processes(process.pid):
                 os.kill(left, signal.SIGKILL)
-
-
-def test_ray_that_is_not_installed(monkeypatch):
-    monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(ValueError, match=r"executor = 'ray' needs Ray \(.*\): pip install 'softgym-envs\[ray\]'"):
-        list(parallel_map(operator.mul, SQUARES, 2, "ray"))
-
-
-# Ray leaves open files and sockets to the garbage collector.
-@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
-def test_ray():
-    import ray
-
-    assert "ray" in EXECUTORS
-    assert list(parallel_map(operator.mul, [], 2, "ray")) == []
-    assert sorted(parallel_map(operator.mul, SQUARES, 2, "ray")) == [k * k for k in range(20)]
-    assert not ray.is_initialized()  # the cluster of the call has been stopped
-    with pytest.raises(ValueError, match="math domain error"):
-        list(parallel_map(math.sqrt, [(4.0,), (-1.0,)], 2, "ray"))
-    assert not ray.is_initialized()

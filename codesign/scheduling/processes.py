@@ -1,4 +1,4 @@
-"""Starting and watching the workers of a study: processes of this machine, or tasks of a Ray cluster."""
+"""Starting and watching the workers of a study, which are processes of this machine."""
 
 from __future__ import annotations
 
@@ -9,14 +9,10 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import softgym_envs
 from softgym_envs import errors
-from softgym_envs.codesign.config import JOURNAL, StudyConfig
 from softgym_envs.codesign.folder import StudyFolder
-from softgym_envs.codesign.scheduling.queue import CALL
-from softgym_envs.executors import ray_cluster
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 
@@ -34,7 +30,7 @@ def run_workers(
     for each of them.
 
     Args:
-        folder: the study; its configuration names the executor.
+        folder: the study.
         phase: name in `softgym_envs.codesign.scheduling.worker.PHASES`.
         count: number of workers.
         tick: called every ``interval`` seconds, and once at the end.
@@ -44,27 +40,9 @@ def run_workers(
         How a worker ended that was not replaced, or None.
 
     Raises:
-        ConfigError: if Ray is requested but not installed, or has several machines and the storage is for one.
         SoftGymError: if an error of the suite ended a worker.
         WorkerError: if any other exception ended a worker.
     """
-    run = _run_on_ray if folder.config.executor == "ray" else _run_processes
-    return run(folder, phase, count, tick, interval)
-
-
-def _search_path() -> str:
-    """``PYTHONPATH`` with which workers find the same modules as this process, those next to its script included."""
-    own = [str(Path(softgym_envs.__file__).resolve().parents[1])]
-    installed = tuple({os.path.join(prefix, "") for prefix in (sys.prefix, sys.base_prefix)})
-    given = [os.path.abspath(entry) for entry in sys.path if not entry.startswith(installed)]
-    return os.pathsep.join(
-        dict.fromkeys([*own, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep)), *given])
-    )
-
-
-def _run_processes(
-    folder: StudyFolder, phase: str, count: int, tick: Callable[[], None], interval: float
-) -> str | None:
     environment = {**os.environ, **dict.fromkeys(THREADS, "1"), "PYTHONPATH": _search_path()}
     command = [sys.executable, "-m", "softgym_envs.codesign.scheduling.worker", str(folder.path), phase]
     with tempfile.TemporaryFile("w+") as output:
@@ -97,6 +75,16 @@ def _run_processes(
     return f"killed by signal {-failed[0]}" if failed else None
 
 
+def _search_path() -> str:
+    """``PYTHONPATH`` with which workers find the same modules as this process, those next to its script included."""
+    own = [str(Path(softgym_envs.__file__).resolve().parents[1])]
+    installed = tuple({os.path.join(prefix, "") for prefix in (sys.prefix, sys.base_prefix)})
+    given = [os.path.abspath(entry) for entry in sys.path if not entry.startswith(installed)]
+    return os.pathsep.join(
+        dict.fromkeys([*own, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep)), *given])
+    )
+
+
 def _release(worker: subprocess.Popen[bytes]) -> None:
     """End a worker by closing its standard input, and wait until it has ended."""
     if worker.stdin is not None:
@@ -112,40 +100,3 @@ def _failure(phase: str, status: int, text: str) -> Exception:
     if status == 2 and separator and isinstance(error, type) and issubclass(error, errors.SoftGymError):
         return error(message)
     return WorkerError(f"a worker of phase '{phase}' failed with exit status {status}:\n\n{text.strip()}")
-
-
-def _run_on_ray(folder: StudyFolder, phase: str, count: int, tick: Callable[[], None], interval: float) -> str | None:
-    with ray_cluster() as ray:
-        machines = len({node["NodeID"] for node in ray.nodes() if node["Alive"]})
-        if machines > 1 and folder.config.storage == JOURNAL:
-            raise errors.ConfigError(
-                f"storage '{JOURNAL}' is for one machine, and the Ray cluster has {machines}; set 'storage' to a "
-                "PostgreSQL database"
-            )
-        task = ray.remote(num_cpus=1, max_retries=folder.config.attempts)(_task)
-        arguments = (str(folder.path), folder.config.model_dump(mode="json"), phase)
-        # A cluster that was started earlier does not have the environment variables of this call.
-        variables = dict.fromkeys(THREADS, "1") | {key: os.environ[key] for key in (CALL,) if key in os.environ}
-        running = [task.options(runtime_env={"env_vars": variables}).remote(*arguments) for _ in range(count)]
-        stopped = None
-        while running:
-            ended, running = ray.wait(running, timeout=interval)
-            tick()
-            for reference in ended:
-                try:
-                    ray.get(reference)
-                except ray.exceptions.RayTaskError as error:
-                    if isinstance(error.cause, errors.SoftGymError):
-                        raise error.cause from None
-                    raise WorkerError(f"a worker of phase '{phase}' failed:\n\n{error}") from error
-                except ray.exceptions.WorkerCrashedError:
-                    stopped = "killed"
-        tick()
-        return stopped
-
-
-def _task(path: str, config: dict[str, Any], phase: str) -> None:
-    """One worker as a Ray task, perhaps on a machine that has no folder of the study yet."""
-    from softgym_envs.codesign.scheduling.worker import PHASES
-
-    PHASES[phase](StudyFolder.create(path, StudyConfig.model_validate(config), wait=True))

@@ -1,11 +1,10 @@
-"""Killed workers, executors, and the dashboard, without a database."""
+"""Killed workers and the dashboard, without a database."""
 
 from __future__ import annotations
 
 import json
 import os
 import signal
-import sys
 from dataclasses import replace
 from wsgiref.util import setup_testing_defaults
 
@@ -24,7 +23,7 @@ from softgym_envs.codesign.scheduling.queue import CALL, TrialQueue
 from softgym_envs.codesign.scheduling.worker import run_trials
 from softgym_envs.codesign.snapshot import load_study
 from softgym_envs.codesign.study import run_study
-from softgym_envs.errors import ConfigError, DataError, MeshingError, SoftGymError
+from softgym_envs.errors import DataError, MeshingError, SoftGymError
 from softgym_envs.testing import wait_until
 from tests.codesign.kills import Sweep, faults
 
@@ -263,25 +262,6 @@ def test_worker_continues_when_its_trial_was_reassigned(study, monkeypatch):
     worker.run_trials(folder)
     assert [trial.state.name for trial in open_study(folder).trials] == ["FAIL", "COMPLETE", "COMPLETE"]
     assert [record.number for record in folder.results()] == [1, 2]
-
-
-def test_ray_that_is_not_installed(study, monkeypatch):
-    monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(ConfigError, match=r"executor = 'ray' needs Ray \(.*\): pip install 'softgym-envs\[ray\]'"):
-        run_workers(study(executor="ray"), "trials", 1)
-
-
-# Ray leaves files and sockets of its cluster to the garbage collector.
-@pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
-def test_ray(tmp_path, tiny):
-    import ray
-
-    config = StudyConfig.model_validate(tiny(trials=4, goals=SMALL, executor="ray", workers=2))
-    results = run_study(config, tmp_path / "study", progress=False)
-    assert results.trials["complete"] == 4
-    assert not ray.is_initialized()
-    folder = StudyFolder(tmp_path / "study")
-    assert faults(folder, {}) == []
 
 
 @pytest.mark.parametrize(

@@ -191,7 +191,6 @@ class FitConfig(Config):
         correction: states on other meshes, by which the efforts are corrected.
         network: kind of the network and its hyper-parameters.
         workers: number of processes that solve FEM states.
-        executor: ``"processes"`` of this machine, or ``"ray"`` for tasks of a cluster.
         seed: seed of the training.
         alone: whether the model will run alone. False for a robot with a ``max_effort``, whose model serves the backend
             ``hybrid`` or a chain of learned parts: they know efforts.
@@ -205,7 +204,6 @@ class FitConfig(Config):
     correction: CorrectionConfig | None = None
     network: NetworkOptions = Field(default_factory=NETWORKS.find("potential").Options)
     workers: int = Field(default=2, gt=0)
-    executor: Literal["processes", "ray"] = "processes"
     seed: int = 0
     alone: bool = True
     trust: TrustConfig | None = None
@@ -432,7 +430,6 @@ def generate_datasets(config: FitConfig, data_folder: str | Path, *, progress: b
             robot_options=robot_options,
             groups_per_shard=data.groups_per_shard,
             workers=config.workers,
-            executor=config.executor,
             progress=progress,
         )
         for name, (robot_options, plan) in plans.items()
@@ -477,7 +474,7 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
     every = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     card = {
         **new_card(robot, config.network.kind),
-        "config": config.model_dump(mode="json", exclude={"executor"}),
+        "config": config.model_dump(mode="json"),
         "domain": domain_of(model, every, data["validation"]),
         "loaded": bool(robot.build().loads.any() or robot.learning.loads),
         "states": {split: len(rows) for split, rows in states.items()},
@@ -513,7 +510,7 @@ def _inputs(config: FitConfig, data: Datasets) -> dict[str, Any]:
         for column in split.values():
             digest.update(np.ascontiguousarray(column).tobytes())
     return {
-        "config": config.model_dump(mode="json", exclude={"workers", "executor"}),
+        "config": config.model_dump(mode="json", exclude={"workers"}),
         "data_sha256": digest.hexdigest(),
     }
 

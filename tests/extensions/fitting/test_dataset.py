@@ -558,18 +558,6 @@ def test_two_workers_make_the_same_data(tmp_path, made):
         assert shard.read_bytes() == (made[0] / shard.name).read_bytes()
 
 
-def test_ray_makes_the_same_data(tmp_path, trunk):
-    data = generate_dataset(tmp_path, "trunk", PLAN, groups_per_shard=2, workers=2, executor="ray", progress=False)
-    assert equal(data, trunk[1])
-    for shard in tmp_path.glob("shard_*"):
-        assert shard.read_bytes() == (trunk[0] / shard.name).read_bytes()
-
-
-def test_unknown_executor(tmp_path):
-    with pytest.raises(ValueError, match="executor = 'threads' is unknown"):
-        generate_dataset(tmp_path, "trunk", PLAN, executor="threads", progress=False)
-
-
 # -- runs that are stopped --------------------------------------------------------------------------------------------
 
 

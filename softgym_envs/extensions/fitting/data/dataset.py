@@ -95,7 +95,6 @@ def generate_dataset(
     robot_options: dict | None = None,
     groups_per_shard: int = 25,
     workers: int = 1,
-    executor: str = "processes",
     progress: bool = True,
 ) -> dict[str, np.ndarray]:
     """Generate a dataset, or finish an interrupted one, and return it.
@@ -111,15 +110,12 @@ def generate_dataset(
         robot_options: options of the robot.
         groups_per_shard: designs per shard.
         workers: number of processes, each with one thread.
-        executor: ``"processes"`` of this machine; ``"ray"``: a Ray cluster (the one of ``RAY_ADDRESS``, or one
-            that is started here), whose machines share the folder. It needs the extra ``ray``.
         progress: show a progress bar.
 
     Raises:
         DataError: if the folder holds a dataset of another plan, or of other bodies because code or a file of the robot
             has changed, another process is writing to it, or no design of the plan is feasible.
         DesignError: if the plan does not fit the robot.
-        ValueError: for an unknown executor.
     """
     folder = Path(folder).absolute()
     options = dict(robot_options or {})
@@ -162,15 +158,13 @@ def generate_dataset(
                 left.unlink(missing_ok=True)
         # Cache the baseline mesh before the workers need it.
         body.build()
-        _make_missing(folder, manifest, plan, workers, executor, progress)
+        _make_missing(folder, manifest, plan, workers, progress)
         data = load_dataset(folder)
         _write_card(card, manifest, data)
     return data
 
 
-def _make_missing(
-    folder: Path, manifest: dict[str, Any], plan: SamplingPlan, workers: int, executor: str, progress: bool
-) -> None:
+def _make_missing(folder: Path, manifest: dict[str, Any], plan: SamplingPlan, workers: int, progress: bool) -> None:
     """Generate the shards that are missing or cannot be read."""
     from tqdm import tqdm
 
@@ -191,7 +185,7 @@ def _make_missing(
     with tqdm(
         total=len(shards), initial=len(shards) - len(missing), unit="shard", desc=folder.name, disable=not progress
     ) as bar:
-        for _ in parallel_map(_make_shard, arguments, workers, executor):
+        for _ in parallel_map(_make_shard, arguments, workers):
             bar.update()
 
 

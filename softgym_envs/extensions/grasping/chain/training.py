@@ -253,7 +253,7 @@ def fit_chain(
         for column in split.values():
             digest.update(np.ascontiguousarray(column).tobytes())
     inputs = {
-        "config": config.model_dump(mode="json", exclude={"workers", "executor"}),
+        "config": config.model_dump(mode="json", exclude={"workers"}),
         "data_sha256": digest.hexdigest(),
     }
     key = hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()[:12]
