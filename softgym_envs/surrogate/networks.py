@@ -5,5 +5,4 @@ from __future__ import annotations
 from softgym_envs.registry import Table
 
 NETWORKS = Table("network", {"potential": "softgym_envs.surrogate.potential.model"}, group="softgym_envs.networks")
-"""Kind to module. Each module has ``Model``, a `SurrogateModel`. What it needs to be fitted besides is said in
-`softgym_envs.extensions.fitting.training`."""
+"""Kind to module. Each module has ``Model``, a `SurrogateModel`; to be fitted, it needs more."""
