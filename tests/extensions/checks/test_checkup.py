@@ -115,7 +115,7 @@ def test_thickness_and_layers_of_a_plate(layers):
 
 
 def test_the_verb_ends_with_status_one_for_a_fault(softgym, tmp_path, monkeypatch):
-    (tmp_path / "deaf_robot.py").write_text("from tests.backends.test_checkup import Deaf\n")
+    (tmp_path / "deaf_robot.py").write_text("from tests.extensions.checks.test_checkup import Deaf\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     status, out, error = softgym("check", "deaf_robot:Deaf", "--bodies", "1", "--commands", "2", "--quiet")
     assert status == 1 and "FAULT  variable 'young_modulus'" in out and error == ""
