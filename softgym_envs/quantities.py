@@ -46,7 +46,7 @@ class Quantity:
     signed: bool = False
 
 
-_LENGTHS = {"mm": 1e-3, "um": 1e-6, "cm": 1e-2}
+_LENGTHS = {"mm": 1e-3, "um": 1e-6, "cm": 1e-2, "in": 0.0254}
 _PRESSURES = {"MPa": 1e6, "kPa": 1e3, "GPa": 1e9, "bar": 1e5}
 
 QUANTITIES: Mapping[str, Quantity] = {

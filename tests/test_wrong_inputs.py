@@ -44,9 +44,9 @@ def body(nodes=NODES, **options):
     return MechanicalModel.from_mesh(nodes, TETRAHEDRA, fixed=nodes[:, 0] == 0.0, **options)
 
 
-def from_file(folder, **options):
+def from_file(folder, width=100.0, **options):
     path = folder / "body.vtk"
-    meshio.Mesh(1e3 * NODES, [("tetra", TETRAHEDRA)]).write(path)
+    meshio.Mesh(width / np.ptp(NODES[:, 0]) * NODES, [("tetra", TETRAHEDRA)]).write(path)
     return MechanicalModel.from_file(path, fixed_box=(-1.0, 1.0, -1.0, 1.0, -1.0, 1.0), **options)
 
 
@@ -130,7 +130,12 @@ MISTAKES = {
     "mesh file in millimetres without its unit": (
         lambda f: from_file(f),
         "the body measures 100 x 20 x 20 m; its size = 100 m is implausible, *; did you mean 0.1 m (100 mm)? (for a "
-        "file in millimetres pass unit='mm', for one in metres unit='m') *",
+        "file in millimetres pass unit='mm', in inches unit='in', in metres unit='m') *",
+    ),
+    "mesh file in inches without its unit": (
+        lambda f: from_file(f, width=4.0),
+        "the body measures 4 x 0.8 x 0.8 m; its size = 4 m is implausible, allowed: 0.001 to 1 m (a file that states "
+        "no unit); *, in inches unit='in', in metres unit='m') *",
     ),
     "goal in millimetres": (
         lambda _: reset(goal=[0.0, 50.0, -90.0]),

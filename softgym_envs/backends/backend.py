@@ -340,7 +340,8 @@ class Backend(ABC):
             ValueError: for a point outside the body, a force that is probably in another unit, or if the backend takes
                 no forces.
         """
-        raise ValueError(f"{type(self).__name__} takes no forces")
+        if load is not None:
+            raise ValueError(f"{type(self).__name__} takes no forces")
 
     def stand_on(self, ground: Ground) -> State:
         """Go to the rest equilibrium on another ground, which stays that of all bodies until the next call.

@@ -123,8 +123,7 @@ class PathHybridBackend(Backend):
         if found is not None and found.trusted:
             return found
         fem = self._follow(known.fem, known.path)
-        if self.takes_touch:
-            fem.touch(self._touch)
+        fem.touch(self._touch)
         self.fem_calls += 1
         return fem.probe(command, mode)
 
@@ -166,8 +165,7 @@ class PathHybridBackend(Backend):
 
     def _go_to(self, state: State) -> None:
         """Bring the learned model to a state of it, under what touches the body now."""
-        if self.takes_touch:
-            self.learned.touch(self._touch)
+        self.learned.touch(self._touch)
         self.learned.restore(state)
 
     def _extra_state(self) -> PointForce | None:
@@ -183,8 +181,7 @@ class PathHybridBackend(Backend):
         fem = self._fem_of(self.design)
         fem.restore(fem.reset() if start is None else start)
         for command, mode, touch in path:
-            if self.takes_touch:
-                fem.touch(touch)
+            fem.touch(touch)
             fem.step(command, mode)
             self.fem_calls += 1
         return fem

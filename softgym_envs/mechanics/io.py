@@ -20,6 +20,9 @@ from softgym_envs.quantities import finite_number
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "in": 0.0254}
 """Metres in each unit of length."""
 
+LARGEST_UNSTATED = 1.0
+"""Largest body [m] of a file without a unit, taken as metres. Above, the file is probably in inches or centimetres."""
+
 _SOLID, _FLAT = ("tetra", "hexahedron", "wedge", "pyramid", "voxel"), ("triangle", "quad", "polygon", "pixel")
 
 
@@ -62,6 +65,11 @@ class VolumeMesh:
                 raise ValueError(unknown_name("group", name, self.groups))
             mask[self.groups[name]] = True
         return mask
+
+
+def states_unit(path: str | Path) -> bool:
+    """Return whether the format of a file states the unit of its lengths."""
+    return file_format(Path(path)) in WITH_UNIT
 
 
 def unit_factor(scale: float | None, unit: str | None) -> float:
@@ -184,7 +192,7 @@ def read_surface(path: str | Path, *, time_limit: float = 60.0) -> tuple[np.ndar
     solid = [(str(shape), block.data) for block, shape in zip(mesh.cells, shapes, strict=True) if shape in _SOLID]
     if solid:
         points, cells, _ = tetrahedra_of(points, solid)
-        return points, boundary_triangles(orient_corners(points, cells)[0]), file_format(path) in WITH_UNIT
+        return points, boundary_triangles(orient_corners(points, cells)[0]), states_unit(path)
     if not any(shape in _FLAT for shape in shapes):
         raise DataError(f"mesh file '{path}' holds no surface")
     return points, _faces(mesh, shapes, points), False
@@ -195,14 +203,14 @@ def _read(
 ) -> tuple[Any, float]:
     """Return the mesh in a file and the factor to metres."""
     factor = unit_factor(scale, unit)
-    states_unit = file_format(path) in WITH_UNIT
-    if states_unit and scale is not None:
+    stated = states_unit(path)
+    if stated and scale is not None:
         raise ValueError(f"scale = {scale:g} must be left out for '{path}', which states its unit")
     if not finite_number(time_limit, "time_limit", "s") > 0.0:
         raise ValueError(f"time_limit = {time_limit} s must be positive")
     if mesh_size is not None and not finite_number(mesh_size, "mesh_size", "m") > 0.0:
         raise ValueError(f"mesh_size = {mesh_size} m must be positive and finite")
-    if states_unit:
+    if stated:
         factor = 1.0
     size = None if mesh_size is None else mesh_size / factor
     return read_file(path, mesh_size=size, time_limit=time_limit), factor

@@ -230,10 +230,12 @@ class MechanicalModel:
             MeshingError: if gmsh cannot be used, or takes too long.
             ValueError: if no node is fixed, or the size of the body is implausible.
         """
-        from softgym_envs.mechanics.io import read_mesh
+        from softgym_envs.mechanics.io import LARGEST_UNSTATED, read_mesh, states_unit
 
         mesh = read_mesh(path, scale=scale, unit=unit, mesh_size=mesh_size, time_limit=time_limit)
-        check_size(mesh.nodes, "for a file in millimetres pass unit='mm', for one in metres unit='m'")
+        stated = scale is not None or unit is not None or states_unit(path)
+        hint = "for a file in millimetres pass unit='mm', in inches unit='in', in metres unit='m'"
+        check_size(mesh.nodes, hint, high=None if stated else LARGEST_UNSTATED, example="a file that states no unit")
         if (fixed is None) == (fixed_box is None):
             raise ValueError("pass the clamped nodes as either 'fixed' or 'fixed_box'")
         if options.get("element", DEFAULT_ELEMENT) != "quadratic":

@@ -129,15 +129,15 @@ def are_rows(numbers: np.ndarray, count: int) -> bool:
     return numbers.dtype.kind in "iu" and bool(((numbers >= 0) & (numbers < count)).all())
 
 
-def check_size(nodes: np.ndarray, hint: str) -> None:
-    """Reject a body whose largest side [m] is not plausible.
+def check_size(nodes: np.ndarray, hint: str, *, high: float | None = None, example: str = "") -> None:
+    """Reject a body whose largest side [m] is not plausible; ``high`` and ``example`` are those of `check_quantity`.
 
     Raises:
         ValueError: with a hint on how to correct the unit.
     """
     sides = np.ptp(nodes, axis=0) if len(nodes) else np.zeros(3)
     spans = " x ".join(f"{side:.3g}" for side in sides)
-    check_quantity("size", sides.max(), f"the body measures {spans} m; its size", hint=hint)
+    check_quantity("size", sides.max(), f"the body measures {spans} m; its size", high=high, example=example, hint=hint)
 
 
 def check_modulus(young_modulus: ArrayLike) -> None:

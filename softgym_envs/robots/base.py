@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import functools
 import inspect
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import PurePath
@@ -251,14 +250,14 @@ class Robot(ABC):
 
         complete = self.design_space.complete(design)
         try:
-            watched, began = WatchedDesign(complete), time.perf_counter()
+            watched = WatchedDesign(complete)
             with locking_accepted(self._has_built or self.reproduces_scene):
                 model = self.assemble(watched)
-            seconds, self._has_built = time.perf_counter() - began, True
+            self._has_built = True
             check_built(self, model, complete)
             self._add_contact(model, watched)
             with locking_accepted():
-                warn_unread(self, model, watched, seconds)
+                warn_unread(self, model, watched)
             return model
         except SoftGymError:
             raise

@@ -89,8 +89,8 @@ _WRITTEN_OTHERWISE = {
 }
 """How the attributes of a robot are written that stand in one of its objects, or have another name."""
 
-UNREAD_SECONDS = 2.0
-"""Time that may be spent once on bodies by which variables that are passed on together are watched [s]."""
+UNREAD_COORDINATES = 100_000
+"""Size of all bodies together by which variables that are passed on together are watched: two to ten seconds, once."""
 
 
 def check_defined(holder: object, cls: type) -> None:
@@ -374,17 +374,16 @@ _WATCHED: WeakSet[type] = WeakSet()
 """Classes of robots whose reading of designs has been watched."""
 
 
-def warn_unread(robot: Robot, model: MechanicalModel, design: WatchedDesign, seconds: float) -> None:
+def warn_unread(robot: Robot, model: MechanicalModel, design: WatchedDesign) -> None:
     """Warn of design variables that change nothing, once for each class: those that `assemble` never reads.
 
-    Where variables are passed on together, the body with another value of each is compared, unless that takes long.
-    What chooses among parts may leave others unread.
+    Where variables are passed on together, the body with another value of each is compared, unless these bodies are
+    large (`UNREAD_COORDINATES`). What chooses among parts may leave others unread.
 
     Args:
         robot: the robot.
         model: what its `assemble` returned.
         design: the watched design from which it did.
-        seconds: how long that took.
     """
     if type(robot) in _WATCHED or any(variable.choices for variable in robot.design_space):
         return
@@ -392,7 +391,7 @@ def warn_unread(robot: Robot, model: MechanicalModel, design: WatchedDesign, sec
     known = [name for name in robot.design_space.names if name not in design.read]
     unread = [name for name in known if name not in design.passed_on]
     passed_on = [name for name in known if name in design.passed_on]
-    if passed_on and seconds * len(passed_on) < UNREAD_SECONDS and not robot.has_own_obstacles:
+    if passed_on and model.nodes.size * len(passed_on) <= UNREAD_COORDINATES and not robot.has_own_obstacles:
         numbers = _numbers_of(model)
         unread += [name for name in passed_on if _same(numbers, robot, _moved(design, name))]
     if unread:
