@@ -25,6 +25,8 @@ PI_GAINS = (0.1, 0.3)
 """Proportional and integral gain per control step. The plant responds to a correction within one step, so the integral
 alone leaves 0.7^k of an error after k steps. The gains of the thesis (0.01 and 0.002) are meant for many calls per
 goal."""
+STEERING = 1.5
+"""By how much a gait is steered over the angle between the robot and its heading [1/rad]."""
 
 
 def make_controller(robot: Robot, task: Task) -> InverseQP:
@@ -165,6 +167,26 @@ class GaitAgent:
         return action
 
 
+class SteerAgent:
+    """A rule by hand: the reference gait of the robot, steered in proportion to how far it looks past its heading.
+
+    Args:
+        seed: not used.
+    """
+
+    title = "steered gait"
+
+    def __init__(self, seed: int = 0) -> None:
+        pass
+
+    def __call__(self, observation: Any, env: Any) -> np.ndarray:
+        """Return the action that leads towards the next command of the gait, shape (n_a,)."""
+        forwards, left, _ = env.state.nodes[env.robot.body_frame + 1 : env.robot.body_frame + 4] @ env.observed_goal
+        gait = env.robot.steered_gait(np.clip(STEERING * np.arctan2(left, forwards), -1.0, 1.0))
+        action: np.ndarray = env.spaces.action(gait[(env.steps + 1) % len(gait)], env.command)
+        return action
+
+
 class RandomAgent:
     """Uniform actions; those of `Robot.antagonists` are balanced.
 
@@ -195,6 +217,7 @@ BASELINES = Table(
         "qp_model": f"{__name__}:ModelQPAgent",
         "qp_pi": f"{__name__}:CorrectedQPAgent",
         "gait": f"{__name__}:GaitAgent",
+        "steer": f"{__name__}:SteerAgent",
         "random": f"{__name__}:RandomAgent",
     },
     group="softgym_envs.agents",
@@ -210,7 +233,8 @@ def make_baseline(name: str, seed: int = 0) -> Agent:
             step, unless the task names another agent for its goals (`Task.qp_agent`); ``"qp_static"``: on the static
             equilibrium under the present command, without momentum; ``"qp_model"``: on the surrogate, whatever the
             plant is; ``"qp_pi"``: as ``"qp_model"``, with a PI controller on the measured effector; ``"gait"``: the
-            reference gait of the robot; ``"random"``: uniform actions; or one of an installed package.
+            reference gait of the robot; ``"steer"``: that gait, steered towards a heading; ``"random"``: uniform
+            actions; or one of an installed package.
         seed: seed of the random agent.
 
     Raises:

@@ -109,6 +109,14 @@ ENVIRONMENTS: dict[str, EnvironmentRow] = {
         backend_options=DYNAMIC,
         task_options={"friction": [0.4, 1.2], "slope": [-0.1, 0.2], "payload": 0.03, "push": 0.4, "push_steps": 10},
     ),
+    "SoftGym/QuadrupedFollow-v0": environment_row(
+        "quadruped",
+        "follow",
+        200,
+        backend="fem",
+        backend_options=DYNAMIC,
+        task_options={"friction": [0.4, 1.2], "push": 0.4, "push_steps": 10},
+    ),
     "SoftGym/SwimmerSwim-v0": environment_row("swimmer", "swim", 100, backend="fem", backend_options=DYNAMIC),
 }
 """All environments of a robot with a task, by ID; `register_environment` and installed packages add to them."""

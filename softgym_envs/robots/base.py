@@ -227,6 +227,17 @@ class Robot(ABC):
         """
         raise ValueError(f"robot '{self.name}' has no reference gait: define reference_gait")
 
+    def steered_gait(self, turn: float) -> np.ndarray:
+        """Return the reference gait, changed so that the robot turns, shape (p, n_a).
+
+        Args:
+            turn: from -1, to the right as fast as this gait can, over 0, the reference gait, to 1, to the left.
+
+        Raises:
+            ValueError: if the robot has none.
+        """
+        raise ValueError(f"robot '{self.name}' has no gait that turns: define steered_gait")
+
     def displacements(self, fractions: np.ndarray) -> np.ndarray:
         """Return the commands, shape (N, n_a), at which states are sampled, for points of the unit cube (N, n_a).
 

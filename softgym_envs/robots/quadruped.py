@@ -148,8 +148,13 @@ class Quadruped(Robot):
 
     def reference_gait(self) -> np.ndarray:
         """Trot, shape (10, 8): diagonal legs swing and stretch together, the other two half a period later."""
+        return self.steered_gait(0.0)
+
+    def steered_gait(self, turn: float) -> np.ndarray:
+        """That trot with shorter swings, or swings backwards, on the side to which the robot turns, shape (10, 8)."""
         phase = 2.0 * np.pi * np.arange(PERIOD)[:, None] / PERIOD + np.pi * np.array([0.0, 1.0, 1.0, 0.0])
-        swing, stretch = np.sin(phase), 0.5 * (1.0 + np.cos(phase))
+        sides = np.array([y for _, y in LEGS.values()])
+        swing, stretch = np.sin(phase) * (1.0 - 2.0 * (turn * sides).clip(min=0.0)), 0.5 * (1.0 + np.cos(phase))
         return TROT * np.stack([stretch - swing, stretch + swing], axis=2).reshape(PERIOD, -1)
 
     def reference_path(self, count: int = 30) -> np.ndarray:

@@ -16,6 +16,8 @@ HOLES = {
     # Contact with the ground is not learned.
     ("SoftGym/QuadrupedClimb-v0", "surrogate"): GROUND,
     ("SoftGym/QuadrupedClimb-v0", "hybrid"): GROUND,
+    ("SoftGym/QuadrupedFollow-v0", "surrogate"): GROUND,
+    ("SoftGym/QuadrupedFollow-v0", "hybrid"): GROUND,
     ("SoftGym/QuadrupedWalk-v0", "surrogate"): GROUND,
     ("SoftGym/QuadrupedWalk-v0", "hybrid"): GROUND,
     # Nothing holds it, so it has no equilibria to learn.

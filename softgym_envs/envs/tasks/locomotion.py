@@ -1,4 +1,4 @@
-"""Locomotion: go straight ahead, as fast as possible; what tasks of robots that walk and swim have in common."""
+"""Locomotion: go where one is told to, as fast as possible; what tasks of robots that walk and swim have in common."""
 
 from __future__ import annotations
 
@@ -51,22 +51,33 @@ class Pose(Sensors):
         assert robot.body_frame is not None
         self.frame, self.size = robot.body_frame, robot.size
         self.effort_scale = np.asarray(robot.effort_scale, dtype=float)
-        short, speed, unit = present(0.1 * robot.size, "m"), present(robot.size, "m/s"), robot.actuators[0].unit
+        unit = robot.actuators[0].unit
         efforts = ", ".join(present(value, effort_unit(unit)) for value in sorted(set(self.effort_scale.tolist())))
         self.parts = tuple(
             (size, what, f"x / (1 + abs(x)) of it{over}", si)
             for size, what, over, si in (
-                (1, "height of the body, against that at the start", f" over {short}", "m"),
-                (1, "place of the body sideways, against that at the start", f" over {short}", "m"),
-                (3, "vertical along the directors of the body", "", ""),
-                (1, "first director sideways", "", ""),
-                (3, "velocity of the body", f" over {speed}", "m/s"),
-                (3, "angular velocity of the body", " over 1 rad/s", "rad/s"),
+                *self.of_body(present(0.1 * robot.size, "m"), present(robot.size, "m/s")),
                 (len(robot.actuators), "effort of each actuator", f" over {efforts}", effort_unit(unit)),
             )
         )
         self.count = sum(size for size, *_ in self.parts)
         self._start: np.ndarray | None = None
+
+    def of_body(self, short: str, speed: str) -> tuple[tuple[int, str, str, str], ...]:
+        """Return the parts that show the body: for each its size, what it is, its scale and its SI unit.
+
+        Args:
+            short: scale of lengths, as text.
+            speed: scale of speeds.
+        """
+        return (
+            (1, "height of the body, against that at the start", f" over {short}", "m"),
+            (1, "place of the body sideways, against that at the start", f" over {short}", "m"),
+            (3, "vertical along the directors of the body", "", ""),
+            (1, "first director sideways", "", ""),
+            (3, "velocity of the body", f" over {speed}", "m/s"),
+            (3, "angular velocity of the body", " over 1 rad/s", "rad/s"),
+        )
 
     def begin(self) -> None:
         self._start = None
@@ -79,20 +90,30 @@ class Pose(Sensors):
             self._start = place.copy()
         speed = np.zeros((4, 3)) if state.motion is None else state.motion.velocity[row : row + 4]
         spin = 0.5 * np.cross(axes, speed[1:]).sum(axis=0)
-        moved = (place - self._start)[[2, 1]] / (0.1 * self.size)
-        pressed = state.effort / self.effort_scale
-        return np.concatenate([moved, axes[:, 2], axes[:1, 1], speed[0] / self.size, spin, pressed])
+        body = self.body((place - self._start) / (0.1 * self.size), axes, speed[0] / self.size, spin)
+        return np.concatenate([*body, state.effort / self.effort_scale])
+
+    def body(self, moved: np.ndarray, axes: np.ndarray, speed: np.ndarray, spin: np.ndarray) -> list[np.ndarray]:
+        """Return the readings of `of_body`.
+
+        Args:
+            moved: way of the body since the start, over its scale, shape (3,).
+            axes: its directors as rows, shape (3, 3).
+            speed: its velocity over its scale, shape (3,).
+            spin: its angular velocity [rad/s], shape (3,).
+        """
+        return [moved[[2, 1]], axes[:, 2], axes[:1, 1], speed, spin]
 
     def further(self, readings: np.ndarray, new: bool) -> np.ndarray:
         return np.zeros(0)
 
 
 class Locomotion(Task):
-    """Go along x, as fast as possible.
+    """Go along a heading, as fast as possible: along x, unless a task draws others.
 
-    Goals are velocities (v, 0, 0) [m/s]; what is compared with them is the mean velocity of the robot over the second
-    half of the episode so far. The distance is by how much that falls short of the goal ahead, and by how much it
-    drifts sideways. Going faster than the goal is no error.
+    Goals are horizontal velocities (vx, vy, 0) [m/s]; what is compared with them is the mean velocity of the robot over
+    the second half of the time since it was given the goal. The distance is by how much that falls short of the goal
+    ahead, and by how much it drifts sideways. Going faster than the goal is no error.
 
     The reward of a step is the speed ahead in sizes of the robot per second, less charges in the same unit for the
     speed sideways, for the work of the actuators, and for what else a task charges. No charge is negative, so rewards
@@ -108,7 +129,7 @@ class Locomotion(Task):
     """
 
     max_episode_steps = 100
-    agents = ("gait", "random")
+    agents: tuple[str, ...] = ("gait", "random")
     qp_agent = "gait"
     distance_scale = DistanceScale("shortfall", "mm/s", 1e3, goal_unit="m/s")
     tallies: tuple[str, ...] = ("speed", "drift", "power")
@@ -143,19 +164,35 @@ class Locomotion(Task):
         return np.tile([self.pace * self.robot.size, 0.0, 0.0], (count, 1, 1))
 
     def check_paths(self, goals: object, leading: tuple[int, ...] = ()) -> np.ndarray:
-        """Return the wanted velocities of episodes [m/s] as an array (*leading, 1, 3).
+        """Return the wanted velocities of episodes [m/s] as an array (*leading, p, 3), p = 1 for a single goal.
 
         Raises:
-            ValueError: for another shape, or a velocity that is not (v, 0, 0) with a positive and finite v.
+            ValueError: for another shape, or a velocity that is not finite, horizontal and more than zero; for a task
+                with a single goal, it must be (v, 0, 0) with a positive v.
         """
-        array = np.asarray(goals, dtype=float)
+        array, single = np.asarray(goals, dtype=float), self.horizon == 1
         array = array[..., None, :] if array.shape == (*leading, 3) else array
-        ahead = array.shape == (*leading, 1, 3) and np.isfinite(array).all() and (array[..., 0] > 0.0).all()
-        if not ahead or array[..., 1:].any():
-            raise ValueError(
-                f"goal must be a velocity (v, 0, 0) [m/s] with v > 0 and finite, got {np.asarray(goals).tolist()}"
-            )
-        return array
+        known = array.ndim == len(leading) + 2 and array.shape[: len(leading)] == leading and array.shape[-1] == 3
+        if known and np.isfinite(array).all() and array.shape[-2] and not array[..., 2].any():
+            ahead = array.shape[-2] == 1 and not array[..., 1].any() and (array[..., 0] > 0.0).all()
+            if ahead if single else array[..., :2].any(axis=-1).all():
+                return array
+        kind = "a velocity (v, 0, 0) [m/s] with v > 0 and finite" if single else (
+            "velocities (vx, vy, 0) [m/s], finite and not zero"
+        )
+        raise ValueError(f"goal must be {kind}, got {np.asarray(goals).tolist()}")
+
+    def turn_to(self, ahead: int = 0) -> tuple[np.ndarray, int]:
+        """Return the direction of the present goal, shape (3,), and the control steps since the robot was given it.
+
+        Args:
+            ahead: control steps from now for which to return it.
+        """
+        step, count = len(self._moments) - 1 + ahead, len(self.path)
+        goal = self.goals(self.path[None], np.array([count]), np.array([step]))[0]
+        number = min(step * count // self.horizon, count - 1)
+        begun = max(-(-number * self.horizon // count) - 1, 0) if number else 0
+        return goal / np.linalg.norm(goal), step - begun
 
     # -- what happens in an episode -----------------------------------------------------------------------------------
 
@@ -180,7 +217,7 @@ class Locomotion(Task):
     # -- what follows from it -----------------------------------------------------------------------------------------
 
     def paced(self, shortest: float | None = None) -> Pace:
-        """Return how the robot goes on in the last part of the episode.
+        """Return how the robot goes on in the last part of the time since it was given its goal.
 
         Args:
             shortest: the last part is the second half, but not shorter than this [s]; None: the last step.
@@ -190,7 +227,8 @@ class Locomotion(Task):
             return Pace(np.zeros(3), 0.0, 0.0, 1.0)
         first, span = self._moments[-2], now.time - self._moments[-2].time
         if shortest is not None:
-            span = max(0.5 * now.time, shortest)
+            begun = self._moments[-1 - self.turn_to()[1]].time
+            span = max(0.5 * (now.time - begun), shortest)
             first = min(self._moments, key=lambda each: abs(each.time - (now.time - span)))
             span = max(now.time - first.time, shortest)
         return Pace(
@@ -198,19 +236,20 @@ class Locomotion(Task):
         )
 
     def measure(self, state: State) -> np.ndarray:
-        """Return the mean velocity [m/s] over the second half of the episode so far, shape (3,)."""
+        """Return the mean velocity [m/s] over the second half of the time since the goal was given, shape (3,)."""
         return self.paced(SHORTEST).velocity
 
     def tally(self) -> dict[str, float]:
-        """Return speeds [m/s], ahead, sideways and of slipping, and the power [W], over the second half so far."""
+        """Return speeds [m/s], ahead, sideways and of slipping, and the power [W], over the same time."""
         pace = self.paced(SHORTEST)
-        found = {"speed": float(pace.velocity[0]), "drift": float(abs(pace.velocity[1]))}
-        found |= {"slip": pace.slip, "power": pace.power}
+        ahead, across = _along(pace.velocity, self.turn_to()[0])
+        found = {"speed": float(ahead), "drift": float(abs(across)), "slip": pace.slip, "power": pace.power}
         return {name: found[name] for name in self.tallies}
 
     def distance(self, effector: Array, goal: Array) -> Array:
-        short = (goal[..., 0] - effector[..., 0]).clip(min=0.0)
-        return np.hypot(short, effector[..., 1] - goal[..., 1])
+        speed = np.linalg.norm(goal, axis=-1)
+        ahead, across = _along(effector, goal / speed[..., None])
+        return np.hypot((speed - ahead).clip(min=0.0), across)
 
     def rate(self, effector: Array, goal: Array, effort_share: Array) -> tuple[Array, dict[str, Array], Array]:
         distance = self.distance(effector, goal)
@@ -219,10 +258,17 @@ class Locomotion(Task):
     def state_terms(self, state: State) -> dict[str, float]:
         """Return the terms of the reward: speed ahead and charges [sizes of the robot per second]."""
         pace, size = self.paced(), self.robot.size
-        speed, drift = float(pace.velocity[0]) / size, float(abs(pace.velocity[1])) / size
+        ahead, across = _along(pace.velocity, self.turn_to()[0])
+        speed, drift = float(ahead) / size, float(abs(across)) / size
         found = {"slip": pace.slip / size, "drift": drift, "work": pace.power / self.power_scale(pace.span)}
         return {"speed": speed} | {name: -share * found[name] for name, share in self.charges.items()}
 
     def reward(self, terms: Mapping[str, Array]) -> Array:
         """Return the sum of the terms."""
         return np.sum(list(terms.values()), axis=0)
+
+
+def _along(velocity: np.ndarray, direction: np.ndarray) -> tuple[Array, Array]:
+    """Return the components of velocities (..., 3) along horizontal directions (..., 3), and to the left of these."""
+    ahead = velocity[..., 0] * direction[..., 0] + velocity[..., 1] * direction[..., 1]
+    return ahead, velocity[..., 1] * direction[..., 0] - velocity[..., 0] * direction[..., 1]

@@ -17,6 +17,7 @@ TASKS = Registry(
         "track": "softgym_envs.envs.tasks.track:Track",
         "carry": "softgym_envs.envs.tasks.carry:Carry",
         "walk": "softgym_envs.envs.tasks.walk:Walk",
+        "follow": "softgym_envs.envs.tasks.follow:Follow",
         "swim": "softgym_envs.envs.tasks.swim:Swim",
     },
     base="softgym_envs.envs.tasks.base:Task",
