@@ -66,13 +66,13 @@ SHOWN = ("finger_reach", "trunk_track", "gripper_lift")
 """Environments of the animation of the home page."""
 FILM_SIZE, FILM_FRAMES = (360, 300), 30
 FILM_AGENTS = {
-    "finger_grasp": "force", "gripper_lift": "close", "quadruped_climb": "gait", "quadruped_follow": "steer",
-    "quadruped_walk": "gait", "swimmer_swim": "gait",
-    "tetrapod_carry": "tetrapod_carry",
+    "crawler_walk": "crawler_walk_gait", "finger_grasp": "force", "gripper_lift": "close", "quadruped_climb": "gait",
+    "quadruped_follow": "steer", "quadruped_walk": "gait", "swimmer_swim": "gait", "tetrapod_carry": "tetrapod_carry",
 }  # fmt: skip
 """Agents of the films of environments, where it is not the inverse QP."""
 FILM_STEPS = {
-    "gripper_lift": 50, "quadruped_climb": 100, "quadruped_follow": 200, "quadruped_walk": 100, "swimmer_swim": 100,
+    "crawler_walk": 100, "gripper_lift": 50, "quadruped_climb": 100, "quadruped_follow": 200, "quadruped_walk": 100,
+    "swimmer_swim": 100,
     "tetrapod_carry": 60,
 }  # fmt: skip
 WALKERS = {"baseline": "quadruped_walk_gait", "winner": "quadruped_walk_winner"}

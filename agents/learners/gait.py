@@ -69,10 +69,10 @@ class Climb(NamedTuple):
 class GaitLearner(Learner):
     """Commands that repeat, improved along the gradient of the way ahead (+x).
 
-    It begins near the reference gait of the robot. Where the robot has two equal sides, these do the same in turns,
-    half a period apart, as in the reference gait: what repeats like that goes straight. A policy adds up a bias that
-    depends on the time in the period and a fixed pull towards it, so it acts as any other policy does, and is limited
-    as these are.
+    It begins near the reference gait of the robot. Where the robot has two equal sides that do the same in that gait,
+    at once or in turns, half a period apart, they go on to do so: what repeats like that goes straight. A policy adds
+    up a bias that depends on the time in the period and a fixed pull towards it, so it acts as any other policy does
+    and is limited as these are.
 
     Args:
         config: configuration of the training; the environment has one body, and ``num_envs`` has no effect.
@@ -115,6 +115,7 @@ class GaitLearner(Learner):
         # What a policy aims at in a step is where it should be after it.
         noise = np.random.default_rng(config.seed).normal(size=resampled.shape)
         start = np.roll((resampled - self._middle) / self._half, -1, axis=0)
+        self._shift = self._shift_of_sides(start)
         self.gait = np.clip(start + config.settings.spread * self._straight(noise), -1.0, 1.0)
         self.step = 0
         self.ways: list[float] = []
@@ -190,12 +191,19 @@ class GaitLearner(Learner):
             carried = carried * follow[k]
         return Climb(float(way[0]), self._straight(gradient), found.design, float(by_way @ way))
 
+    def _shift_of_sides(self, gait: np.ndarray) -> int | None:
+        """Return by how many control steps one side does later what the other one does, or None."""
+        if self.env.robot.mirrored_actuators is None:
+            return None
+        shifts = {0, self.config.settings.period // 2}
+        return next((k for k in sorted(shifts) if np.allclose(self._mirrored(gait, k), gait, atol=1e-9)), None)
+
+    def _mirrored(self, gait: np.ndarray, shift: int) -> np.ndarray:
+        return np.roll(gait, shift, axis=0)[:, list(self.env.robot.mirrored_actuators)]
+
     def _straight(self, change: np.ndarray) -> np.ndarray:
-        """Return the part of a change of the gait (p, n_a) after which both sides still do the same in turns."""
-        mirror, half = self.env.robot.mirrored_actuators, self.config.settings.period // 2
-        if mirror is None or self.config.settings.period % 2:
-            return change
-        return 0.5 * (change + np.roll(change, half, axis=0)[:, list(mirror)])
+        """Return the part of a change of the gait (p, n_a) after which both sides still do the same."""
+        return change if self._shift is None else 0.5 * (change + self._mirrored(change, self._shift))
 
     def commands(self, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the commands of the first control steps from rest, as the policy gives them.

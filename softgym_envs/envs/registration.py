@@ -117,6 +117,14 @@ ENVIRONMENTS: dict[str, EnvironmentRow] = {
         backend_options=DYNAMIC,
         task_options={"friction": [0.4, 1.2], "push": 0.4, "push_steps": 10},
     ),
+    "SoftGym/CrawlerWalk-v0": environment_row(
+        "crawler",
+        "walk",
+        100,
+        backend="fem",
+        backend_options=DYNAMIC,
+        task_options={"pace": 0.08, "slip": 0.1, "work": 0.02},
+    ),
     "SoftGym/SwimmerSwim-v0": environment_row("swimmer", "swim", 100, backend="fem", backend_options=DYNAMIC),
 }
 """All environments of a robot with a task, by ID; `register_environment` and installed packages add to them."""

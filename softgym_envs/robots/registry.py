@@ -23,6 +23,7 @@ ROBOTS = Registry(
         "tetrapod": "softgym_envs.robots.tetrapod:Tetrapod",
         "quadruped": "softgym_envs.robots.quadruped:Quadruped",
         "swimmer": "softgym_envs.robots.swimmer:Swimmer",
+        "crawler": "softgym_envs.robots.crawler:Crawler",
         "three_finger_gripper": "softgym_envs.robots.grippers:ThreeFingerGripper",
     },
     base="softgym_envs.robots.base:Robot",

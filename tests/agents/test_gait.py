@@ -49,6 +49,14 @@ def test_both_sides_do_the_same_in_turns():
     assert len(learner.ways) == 3 and learner.ways[-1] > learner.ways[0]
 
 
+def test_both_sides_do_the_same_at_once_where_the_reference_gait_does():
+    crawl = EnvironmentConfig(id="SoftGym/CrawlerWalk-v0")
+    learner = GaitLearner(config(225, crawl, seed=1, gait={"period": 25}))
+    learner.learn(225, lambda count: None)
+    np.testing.assert_allclose(learner.gait, learner.gait[:, [0, 2, 1, 4, 3]], atol=1e-12)
+    assert max(learner.ways) > learner.ways[0] > 0.0
+
+
 def test_the_environment_follows_the_commands_of_the_learner():
     learner = GaitLearner(config(30))
     weights = learner.weights()

@@ -13,6 +13,8 @@ BACKENDS = ("fem", "surrogate", "hybrid")
 
 GROUND = "no weights ship for 'quadruped', which touches something: use backend='fem'"
 HOLES = {
+    ("SoftGym/CrawlerWalk-v0", "surrogate"): GROUND.replace("quadruped", "crawler"),
+    ("SoftGym/CrawlerWalk-v0", "hybrid"): GROUND.replace("quadruped", "crawler"),
     # Contact with the ground is not learned.
     ("SoftGym/QuadrupedClimb-v0", "surrogate"): GROUND,
     ("SoftGym/QuadrupedClimb-v0", "hybrid"): GROUND,

@@ -67,7 +67,7 @@ def test_robot_presses_a_wall(name):
     assert (potential[h] - potential[-h]) / (2 * h) == pytest.approx(pressing, rel=1e-4)
 
 
-TOUCHING = {"press_finger": "touch", "quadruped": "cross"}
+TOUCHING = {"press_finger": "touch", "quadruped": "cross", "crawler": "cross"}
 """The bar lies flat on the finger; legs begin inside the trunk."""
 
 
