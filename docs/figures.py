@@ -3,17 +3,18 @@
 A marked place in a Markdown file is rewritten::
 
     <!-- figure: headlines -->the table of the README<!-- /figure -->
+    <!-- figure: trust -->the table of what shipped weights say about their errors<!-- /figure -->
     <!-- figure: shared_finger :: cube, mean [mm] :: .2f -->0.23<!-- /figure -->
 
-The second form names a record, one of its results, and how to write it:
+The last form names a record, one of its results, and how to write it:
 
 * a result inside a group is named ``group: name``;
 * a result may be a pattern with ``*``; then ``min`` or ``max`` in front of the format says which match to take;
 * ``[1]`` in front of the format takes an item of a list;
 * an empty format writes the value as it stands.
 
-Records stand in ``studies/*/results.json`` and, for speed, in ``benchmarks/results.json``. A test compares all pages
-with them. Pages of studies are frozen and have no marked places.
+Records stand in ``studies/*/results.json`` and, for speed, in ``benchmarks/results.json``; trust stands in the cards of
+weights. A test compares all pages with them. Pages of studies are frozen and have no marked places.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import argparse
 import json
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,8 @@ from typing import Any
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.config import load_config
 from softgym_envs.errors import DataError
+from softgym_envs.robots.registry import make_robot
+from softgym_envs.surrogate.pretrained import pretrained_folder, shipped_robots
 from softgym_envs.units import display
 from softgym_envs.wording import decimal
 
@@ -138,6 +141,38 @@ def headlines() -> str:
     return "\n".join(lines)
 
 
+def trust() -> str:
+    """Shipped weights: errors, and what those that were calibrated by strata say about them, from their cards."""
+    lines = [
+        "| weights | goal tolerance | same displacements: mean, worst | same commands, inside: mean, worst "
+        "| at corners | trusted inside, at corners [%] | worst trusted | covered inside, at corners [%] |",
+        "| --- | --: | --: | --: | --: | --: | --: | --: |",
+    ]
+
+    def lengths(*values: float) -> str:
+        return ", ".join(f"{1e3 * value:.2g}" for value in values)
+
+    for name, (robot, options) in shipped_robots().items():
+        body = make_robot(robot, **options)
+        card = json.loads((pretrained_folder(body) / "model.json").read_text())
+        cells = [f"`{name}`", f"{1e3 * body.goal_tolerance:.3g}"]
+        cells.append(lengths(card["test"]["effector_mean"], card["test"]["effector_worst"]))
+        if strata := card.get("calibration", {}).get("strata"):
+            ends = strata["inside"], strata["corners"]
+            cells += [lengths(row["mean"], row["worst"]) for row in ends]
+            cells.append(", ".join(f"{100 * row['trusted']:.0f}" for row in ends))
+            cells.append(lengths(max(row["worst_trusted"] for row in strata.values())))
+            cells.append(", ".join(f"{100 * row['coverage']:.0f}" for row in ends))
+        else:
+            cells += [""] * 5
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+TABLES: dict[str, Callable[[], str]] = {"headlines": headlines, "trust": trust}
+"""Whole tables by the name of their marked place."""
+
+
 def fill(text: str) -> str:
     """Return a Markdown page with every marked place rewritten from the records."""
 
@@ -145,10 +180,10 @@ def fill(text: str) -> str:
         name, *rest = (part.strip() for part in match["key"].split("::"))
         if rest:
             content = figure(name, *rest)
-        elif name == "headlines":
-            content = f"\n\n{headlines()}\n\n"
+        elif name in TABLES:
+            content = f"\n\n{TABLES[name]()}\n\n"
         else:
-            raise DataError(f"'{name}' is no table; allowed: headlines")
+            raise DataError(f"'{name}' is no table; allowed: {', '.join(TABLES)}")
         return f"{match[1]}{content}{match[4]}"
 
     return MARKER.sub(replace, text)

@@ -91,7 +91,7 @@ def test_a_marker_is_filled_with_its_result(recorded, marker, text):
         ("speed :: c", "0 results named 'c'"),
         ("speed :: *: error [mm] :: .1f", r"2 results named '\*: error \[mm\]'"),
         ("spede :: a", "no record 'spede'; allowed: speed"),
-        ("headline", "'headline' is no table; allowed: headlines"),
+        ("headline", "'headline' is no table; allowed: headlines, trust"),
     ],
 )
 def test_a_wrong_marker_is_refused(recorded, marker, message):

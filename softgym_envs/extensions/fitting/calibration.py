@@ -388,6 +388,26 @@ def calibrate(
     return found
 
 
+def tested(
+    folder: str | Path, robot: Robot, *, bodies: int = 16, states: int = 5, adversarial_states: int = 500,
+    seed: int = 12, state_folder: str | Path | None = None, kept_only: bool = False, workers: int = 1,
+) -> dict[str, StratumReport]:  # fmt: skip
+    """Return how calibrated weights do on states that their calibration has not seen; their card stays as it is.
+
+    Args: as for `calibrate`.
+
+    Raises:
+        ValueError: for the seed of the calibration.
+    """
+    model = load_model(folder, robot)
+    if model.card.get("calibration", {}).get("seed") == seed:
+        raise ValueError(f"seed = {seed} is that of the calibration of '{folder}': choose another one")
+    parts = [judged_states(model, bodies, states, seed, state_folder, kept_only, workers)]
+    if adversarial_states:
+        parts.append(adversarial_search(model, adversarial_states, states, seed, state_folder, workers=workers))
+    return report(model, StratifiedStates.join(parts))
+
+
 def cross_validated(model: SurrogateModel, states: StratifiedStates, folds: int = 16) -> dict[str, StratumReport]:
     """Return how a model does where its calibration has not seen the body, for states too expensive to solve others.
 

@@ -76,7 +76,8 @@ def _is_part(config: Path) -> bool:
 @click.command("calibrate-trust")
 @click.argument("robot", shell_complete=options.complete_robot)
 @options.robot_option
-@click.option("--weights", type=options.PATH, required=True, help="Folder of the weights, whose card is written.")
+@click.option("--weights", type=options.PATH, help="Folder of the weights, whose card is written.")
+@click.option("--test", is_flag=True, help="Only judge the weights, by default the shipped ones, on a seed of its own.")
 @click.option("--folder", type=options.PATH, help="Keep the FEM states in this folder; an interrupted run continues.")
 @click.option(
     "--bodies", type=click.IntRange(1), default=64, show_default=True, help="Number of bodies in each stratum."
@@ -95,7 +96,8 @@ def _is_part(config: Path) -> bool:
 def calibrate_trust(
     robot: str,
     options_: tuple[str, ...],
-    weights: Path,
+    weights: Path | None,
+    test: bool,
     folder: Path | None,
     bodies: int,
     states: int,
@@ -110,12 +112,20 @@ def calibrate_trust(
     covers 95 % of the errors under commands in each stratum. Then the limit of trust is lowered until a search finds
     no trusted state that is off by more than the goal tolerance. The result is written to the card of the weights.
     Bodies of learned parts have one command each, and no search.
+
+    With --test nothing is written: calibrated weights are judged as they are, on states of another --seed.
     """
     from dataclasses import asdict
 
-    from softgym_envs.extensions.fitting.calibration import calibrate
+    from softgym_envs.extensions.fitting.calibration import calibrate, tested
+    from softgym_envs.surrogate.pretrained import pretrained_folder
 
     body = options.robot_of(robot, options_)
+    if test and body.learning.parts:
+        raise click.UsageError(f"--test judges weights of whole robots; those of '{robot}' are of learned parts")
+    if weights is None and not test:
+        raise click.UsageError("--weights FOLDER is missing: a calibration writes to the card of the weights there")
+    weights = weights or pretrained_folder(body)
     if body.learning.parts:
         from softgym_envs.extensions.fitting.parts.calibration import calibrate_parts
 
@@ -123,7 +133,7 @@ def calibrate_trust(
         click.echo(json.dumps(found_of_parts, indent=2))
         return
     with nullcontext() if folder is None else options.resumable():
-        found = calibrate(
+        found = (tested if test else calibrate)(
             weights, body, bodies=bodies, states=states,
             adversarial_states=adversarial_states, seed=seed, state_folder=folder, kept_only=kept_only, workers=workers,
         )  # fmt: skip

@@ -487,6 +487,21 @@ def test_calibration_of_weights_from_start_to_end(tmp_path, monkeypatch):
     assert again.keys() == rows.keys()
     kept = module.calibration_states(load_model(folder, robot), tmp_path / "states")
     assert {name: asdict(row) for name, row in report(model, kept).items()} == rows
+    # A test on other states leaves the card as it is, and refuses those of the calibration.
+    monkeypatch.undo()
+    new = ["trunk", "--test", "--weights", str(folder), "--bodies", "2", "--states", "2", "--adversarial-states", "8"]
+    result = CliRunner().invoke(calibrate_trust, [*new, "--seed", "12"], catch_exceptions=False)
+    assert json.loads(result.output).keys() == rows.keys()
+    assert (folder / "model.json").read_text() == card
+    with pytest.raises(ValueError, match="seed = 11 is that of the calibration"):
+        CliRunner().invoke(calibrate_trust, new, catch_exceptions=False)
+
+
+def test_a_calibration_names_the_weights_that_it_writes_to():
+    result = CliRunner().invoke(calibrate_trust, ["trunk"])
+    assert result.exit_code == 2 and "--weights FOLDER is missing" in result.output
+    result = CliRunner().invoke(calibrate_trust, ["tetrapod", "--test"])
+    assert result.exit_code == 2 and "learned parts" in result.output
 
 
 def test_weights_without_a_spread_are_refused(tmp_path):
