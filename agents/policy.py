@@ -109,6 +109,7 @@ class Policy:
         hidden: weights (d, w) and biases (w,) of each hidden layer.
         memory: weights of a gated recurrent unit in place of hidden layers, see `remember`; None without.
         clock: further biases of the last layer in the steps of a period, shape (p, n_a); None without.
+        gains: what observations add to these, shape (p, n_a, d); None without.
         mean: weights and biases of the last layer.
         observation_size: number of inputs.
 
@@ -146,6 +147,7 @@ class Policy:
                 k += 2  # activations sit between the linear layers
             self.mean = tensors["actor.mu.weight"].T, tensors["actor.mu.bias"]
             self.clock: np.ndarray | None = tensors.get("actor.clock")
+            self.gains: np.ndarray | None = tensors.get("actor.gains")
         except KeyError as error:
             raise WeightsError(f"policy '{self.path}' lacks tensor {error}") from None
         first = self.memory[0] if self.memory else self.hidden[0] if self.hidden else self.mean
@@ -185,8 +187,14 @@ class Policy:
     def begin(self) -> Callable[[np.ndarray], np.ndarray]:
         """Return a function like `__call__` for one episode, or a batch of episodes that begin together."""
         if self.clock is not None:
-            biases = itertools.cycle(self.clock)
-            return lambda observation: np.tanh(self._last(observation) + next(biases))
+            phases, gains = itertools.cycle(range(len(self.clock))), self.gains
+            biases = self.clock
+
+            def step(observation: np.ndarray) -> np.ndarray:
+                k, last = next(phases), self._last(observation)
+                return np.tanh(last + biases[k] + (0.0 if gains is None else observation @ gains[k].T))
+
+            return step
         if self.memory is None:
             return self
         read, recall = self.memory

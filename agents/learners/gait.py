@@ -23,6 +23,7 @@ from softgym_envs.errors import ConvergenceError
 
 if TYPE_CHECKING:
     from softgym_envs.mechanics.solvers.beam_design import Neighbours
+    from softgym_envs.robots.base import Robot
 
 TIGHTNESS = 1.0
 """How fast commands follow those of the gait, in their rates over a distance to them of one rate."""
@@ -66,6 +67,58 @@ class Climb(NamedTuple):
     value: float
 
 
+def check_compiled(config: TrainConfig, backend: object) -> None:
+    """Check that a learner can follow derivatives through the motions of an environment.
+
+    Raises:
+        ValueError: for an environment with drawn bodies, other actions than changes of commands, or without motion on
+            finite elements in compiled code.
+    """
+    learner, environment = config.learner, config.environment
+    if environment.sample_design or environment.action_mode != "increment" or environment.residual_scale:
+        raise ValueError(
+            f"learner '{learner}' needs one body, action_mode = increment and no residual_scale, got sample_design = "
+            f"{environment.sample_design}, {environment.action_mode} and {environment.residual_scale:g}"
+        )
+    if not isinstance(backend, FEMBackend) or not backend.moving or backend.not_compiled is not None:
+        why = (backend.not_compiled if isinstance(backend, FEMBackend) else None) or "no motion"
+        raise ValueError(f"learner '{learner}' needs a motion on finite elements in compiled code: {why}")
+
+
+def resampled_gait(robot: Robot, period: int) -> np.ndarray:
+    """Return where a policy of another period should be after each step of the reference gait, shape (period, n_a).
+
+    -1 and 1 are the ends of the ranges of the actuators.
+    """
+    gait = robot.reference_gait()
+    places = np.arange(period) * len(gait) / period
+    after = (np.floor(places).astype(int) + 1) % len(gait)
+    share = (places % 1.0)[:, None]
+    resampled = (1.0 - share) * gait[np.floor(places).astype(int)] + share * gait[after]
+    middle, half = 0.5 * (robot.lower + robot.upper), 0.5 * (robot.upper - robot.lower)
+    return np.roll((resampled - middle) / half, -1, axis=0)
+
+
+def shift_of_sides(robot: Robot, gait: np.ndarray) -> int | None:
+    """Return by how many control steps one side does later what the other one does in a gait (p, n_a), or None."""
+    if robot.mirrored_actuators is None:
+        return None
+    other, shifts = gait[:, list(robot.mirrored_actuators)], {0, len(gait) // 2}
+    return next((k for k in sorted(shifts) if np.allclose(np.roll(other, k, axis=0), gait, atol=1e-9)), None)
+
+
+def command_gradient(by_part: np.ndarray, parts: int) -> np.ndarray:
+    """Return derivatives by the commands of control steps (k, n_a) from those by their time steps (k parts, n_a).
+
+    Time steps lie on a ramp from the last command to the next.
+    """
+    by_part = by_part.reshape(-1, parts, by_part.shape[1])
+    share = (np.arange(1, parts + 1) / parts)[:, None]
+    by_command = (share * by_part).sum(axis=1)
+    by_command[:-1] += ((1.0 - share) * by_part[1:]).sum(axis=1)
+    return by_command
+
+
 class GaitLearner(Learner):
     """Commands that repeat, improved along the gradient of the way ahead (+x).
 
@@ -92,30 +145,16 @@ class GaitLearner(Learner):
 
     def __init__(self, config: TrainConfig) -> None:
         super().__init__(config)
-        environment = config.environment
-        if environment.sample_design or environment.action_mode != "increment" or environment.residual_scale:
-            raise ValueError(
-                "learner 'gait' needs one body, action_mode = increment and no residual_scale, got sample_design = "
-                f"{environment.sample_design}, {environment.action_mode} and {environment.residual_scale:g}"
-            )
-        env: Any = environment.make().unwrapped
+        env: Any = config.environment.make().unwrapped
         self.env, backend = env, env.backend
-        if not isinstance(backend, FEMBackend) or not backend.moving or backend.not_compiled is not None:
-            why = backend.not_compiled if isinstance(backend, FEMBackend) else None
-            raise ValueError(f"learner 'gait' needs a motion on finite elements in compiled code: {why or 'no motion'}")
+        check_compiled(config, backend)
         self.backend = backend
         robot = env.robot
         self._middle, self._half = 0.5 * (robot.lower + robot.upper), 0.5 * (robot.upper - robot.lower)
         self._gain = TIGHTNESS * self._half / robot.rates
-        gait = robot.reference_gait()
-        places = np.arange(config.settings.period) * len(gait) / config.settings.period
-        after = (np.floor(places).astype(int) + 1) % len(gait)
-        share = (places % 1.0)[:, None]
-        resampled = (1.0 - share) * gait[np.floor(places).astype(int)] + share * gait[after]
-        # What a policy aims at in a step is where it should be after it.
-        noise = np.random.default_rng(config.seed).normal(size=resampled.shape)
-        start = np.roll((resampled - self._middle) / self._half, -1, axis=0)
-        self._shift = self._shift_of_sides(start)
+        start = resampled_gait(robot, config.settings.period)
+        noise = np.random.default_rng(config.seed).normal(size=start.shape)
+        self._shift = shift_of_sides(robot, start)
         self.gait = np.clip(start + config.settings.spread * self._straight(noise), -1.0, 1.0)
         self.step = 0
         self.ways: list[float] = []
@@ -179,24 +218,13 @@ class GaitLearner(Learner):
         by_x = np.zeros_like(rollout.x)
         by_x[end, row], by_x[begin, row] = by_way, -by_way
         found = rollout.gradient(by_x=by_x, neighbours=neighbours)
-        by_part = found.commands.reshape(count, parts, -1)
-        # Time steps lie on a ramp from the last command to the next.
-        share = (np.arange(1, parts + 1) / parts)[:, None]
-        by_command = (share * by_part).sum(axis=1)
-        by_command[:-1] += ((1.0 - share) * by_part[1:]).sum(axis=1)
+        by_command = command_gradient(found.commands, parts)
         gradient, carried = np.zeros_like(self.gait), np.zeros(by_command.shape[1])
         for k in reversed(range(count)):
             carried = carried + by_command[k]
             gradient[k % settings.period] += carried * pull[k]
             carried = carried * follow[k]
         return Climb(float(way[0]), self._straight(gradient), found.design, float(by_way @ way))
-
-    def _shift_of_sides(self, gait: np.ndarray) -> int | None:
-        """Return by how many control steps one side does later what the other one does, or None."""
-        if self.env.robot.mirrored_actuators is None:
-            return None
-        shifts = {0, self.config.settings.period // 2}
-        return next((k for k in sorted(shifts) if np.allclose(self._mirrored(gait, k), gait, atol=1e-9)), None)
 
     def _mirrored(self, gait: np.ndarray, shift: int) -> np.ndarray:
         return np.roll(gait, shift, axis=0)[:, list(self.env.robot.mirrored_actuators)]

@@ -19,11 +19,16 @@ LARGEST_GRADIENT = 1.0
 """Largest norm of the gradient of all weights."""
 
 
-class GradientConfig(Config):
-    """Hyperparameters of the learners that know the model."""
+class RateConfig(Config):
+    """Learning rates of Adam."""
 
     learning_rate: float = Field(default=2e-3, gt=0)
     final_learning_rate: float = Field(default=4e-5, gt=0, description="reached linearly at the last step")
+
+
+class GradientConfig(RateConfig):
+    """Hyperparameters of the learners that know the model."""
+
     net_arch: list[int] = [128, 128]
     members: int | None = Field(
         default=1, ge=1, description="of the surrogate's ensemble, in training; evaluations use all"
@@ -41,7 +46,7 @@ class NetworkLearner(Learner):
     The learning rate falls linearly with the steps to that given as final; without that, success oscillates.
     """
 
-    def _begin(self, parameters: Mapping[str, torch.nn.Parameter], options: GradientConfig) -> None:
+    def _begin(self, parameters: Mapping[str, torch.nn.Parameter], options: RateConfig) -> None:
         """Begin with weights, under the names of `weights`, at the first step."""
         import torch
 

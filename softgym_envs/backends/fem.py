@@ -394,11 +394,12 @@ class FEMBackend(Backend):
         """Why the general solver computes the present body; None for a body of beams that compiled code can solve."""
         return (self._dynamics or self._statics).not_compiled
 
-    def roll_out(self, commands: np.ndarray) -> Rollout:
+    def roll_out(self, commands: np.ndarray, forces: np.ndarray | None = None) -> Rollout:
         """Move the present body under commanded displacements without changing the present state.
 
         Args:
             commands: one for each control step, shape (k, n_a).
+            forces: on the first effector in each of them [N], shape (k, 3); default none.
 
         Returns:
             The motion, with one entry for each time step, and its gradients; it holds the solver until the next step.
@@ -414,7 +415,13 @@ class FEMBackend(Backend):
         kept, start = self._motion, self.state.command
         try:
             before = np.vstack([start[None], commands[:-1]])
-            return roll_out(self._dynamics, np.concatenate([*map(self.steps.ramp, before, commands)]))
+            loads = None
+            if forces is not None:
+                loads = np.zeros((len(commands), self.state.effector.size))
+                loads[:, :3] = forces
+                loads = loads.repeat(self.steps.count, axis=0)
+            ramps = np.concatenate([*map(self.steps.ramp, before, commands)])
+            return roll_out(self._dynamics, ramps, forces=loads)
         finally:
             self._go_back(kept)
 

@@ -28,6 +28,7 @@ class Bearing(Pose):
     """
 
     direction: np.ndarray
+    signs = (1, 1, -1, 1, 1, -1, 1, -1, 1, -1, 1, -1)
 
     def of_body(self, short: str, speed: str) -> tuple[tuple[int, str, str, str], ...]:
         return (

@@ -45,7 +45,12 @@ class Pose(Sensors):
 
     Args:
         robot: a robot with a `body_frame`.
+
+    Attributes:
+        signs: of the readings of the body, as its mirror image across the plane of x and z has them.
     """
+
+    signs: tuple[int, ...] = (1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1)
 
     def __init__(self, robot: Robot) -> None:
         assert robot.body_frame is not None
@@ -177,9 +182,9 @@ class Locomotion(Task):
             ahead = array.shape[-2] == 1 and not array[..., 1].any() and (array[..., 0] > 0.0).all()
             if ahead if single else array[..., :2].any(axis=-1).all():
                 return array
-        kind = "a velocity (v, 0, 0) [m/s] with v > 0 and finite" if single else (
-            "velocities (vx, vy, 0) [m/s], finite and not zero"
-        )
+        kind = "velocities (vx, vy, 0) [m/s], finite and not zero"
+        if single:
+            kind = "a velocity (v, 0, 0) [m/s] with v > 0 and finite"
         raise ValueError(f"goal must be {kind}, got {np.asarray(goals).tolist()}")
 
     def turn_to(self, ahead: int = 0) -> tuple[np.ndarray, int]:

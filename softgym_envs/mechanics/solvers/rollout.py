@@ -173,7 +173,12 @@ def _over_time(name: str, values: np.ndarray | None, shape: tuple[int, ...]) -> 
     return out
 
 
-def roll_out(dynamics: Dynamics, commands: np.ndarray, mode: str | Sequence[str] = "displacement") -> Rollout:
+def roll_out(
+    dynamics: Dynamics,
+    commands: np.ndarray,
+    mode: str | Sequence[str] = "displacement",
+    forces: np.ndarray | None = None,
+) -> Rollout:
     """Move a body under commands, one for each time step, and record the motion for gradients.
 
     Args:
@@ -181,6 +186,7 @@ def roll_out(dynamics: Dynamics, commands: np.ndarray, mode: str | Sequence[str]
             dissipation are not counted.
         commands: shape (k, n_a).
         mode: as for `Dynamics.advance`.
+        forces: on the effector rows in each of these time steps [N], shape (k, n_e); default none.
 
     Raises:
         ConvergenceError: if a time step cannot be taken; the dynamics stay where they were.
@@ -203,6 +209,9 @@ def roll_out(dynamics: Dynamics, commands: np.ndarray, mode: str | Sequence[str]
         raise ValueError("gradients need actuators that can push: one that hangs slack does not follow its command")
     targets = np.zeros((len(commands), size))
     targets[:, :count] = commands
+    if forces is not None:
+        # Rows of effectors follow those of actuators.
+        targets[:, count : count + sum(c.size for c in dynamics.model.constraints["e"])] = forces
     contact, touching = beams.body.contact, dynamics.linearisation.contact
     anchors = None if contact is None or touching is None else anchors_of(contact, touching.memory)
     room = ROOM * len(commands) + 64
