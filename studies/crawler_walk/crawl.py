@@ -29,7 +29,7 @@ GOAL = np.array([[0.0108, 0.0, 0.0]])
 BODIES, GRADIENTS, PERIOD = 7, 20, 25
 OTHERS = ({"elements": 4}, {"friction": 0.4}, {"friction": 1.2})
 """A finer mesh, and other grounds."""
-PERIODS = (15, 50, 100)
+PERIODS = (15, 50)
 """Control steps of slower and faster gaits of the baseline."""
 
 
@@ -93,20 +93,9 @@ def main() -> None:
     found = {"baseline": dict(space.baseline), "nested": winner(given.nested), "common": winner(given.common)}
     designs = found | {f"body_{k}": dict(space.from_unit(unit)) for k, unit in enumerate(units)}
     data["designs"] = designs
-    for name in found:
-        for seed in range(3):
-            own(f"{name}_seed_{seed}", designs[name], seed)
-        once(f"{name}_common_gait", lambda name=name: speed("gait", designs[name]))
-    for name in found:
-        for options in OTHERS:
-            own("_".join([name, *(f"{k}_{v}" for k, v in options.items())]), designs[name], **options)
-        # The same gait, not a new one.
-        path = folder / f"{name}_seed_0" / "policy.safetensors"
-        once(f"{name}_gait_on_4", lambda name=name, path=path: speed(path, designs[name], elements=4))
-    for k in range(BODIES):
-        name = f"body_{k}"
-        once(f"{name}_common_gait", lambda name=name: speed("gait", designs[name]))
-        own(f"{name}_seed_0", designs[name])
+    for name, design in designs.items():
+        once(f"{name}_common_gait", lambda design=design: speed("gait", design))
+        own(f"{name}_seed_0", design)
     baseline = folder / "baseline_seed_0" / "policy.safetensors"
     for name, design in designs.items():
         once(f"{name}_baseline_gait", lambda design=design: speed(baseline, design))
@@ -117,6 +106,15 @@ def main() -> None:
     data["tau"] = {
         judge: list(kendalltau(judges[judge], judges["seed_0"])) for judge in ("common_gait", "baseline_gait")
     }
+    for name in found:
+        own(f"{name}_seed_1", designs[name], 1)
+        own(f"{name}_seed_2", designs[name], 2)
+    for name in ("baseline", "nested"):
+        # The same gait on a finer mesh; new ones there and on other grounds.
+        path = folder / f"{name}_seed_0" / "policy.safetensors"
+        once(f"{name}_gait_on_4", lambda name=name, path=path: speed(path, designs[name], elements=4))
+        for options in OTHERS:
+            own("_".join([name, *(f"{k}_{v}" for k, v in options.items())]), designs[name], **options)
     for period in PERIODS:
         own(f"baseline_period_{period}", designs["baseline"], period=period)
     write_json(place, data)
