@@ -197,7 +197,7 @@ class Episodes:
         if self._remembers:
             for i in index.tolist():
                 own, random = self._tasks[i], self._generator(i)
-                own.path = self.paths[i, : self.counts[i]].copy()
+                own.wanted = self.paths[i, : self.counts[i]].copy()
                 own.begin(random)
                 if own.load is not None:
                     own.load.begin(random)

@@ -248,7 +248,7 @@ class Task(ABC):
         needs_state: whether the task reads whole mechanical states, one after the other, since it has methods of its
             own that take one: `measure`, `state_terms` or `is_failed`.
         robot: the robot.
-        path: goals of the present episode, for tasks that remember anything of it, shape (p, 3).
+        wanted: goals of the present episode, for tasks that remember anything of it, shape (p, 3).
         axes: coordinates of the effector that count, 1 or 0, shape (3,).
         success_distance: distance below which a goal counts as reached [m].
         goal_scale: unit of goals and of what is compared with them in observations [m].
@@ -277,7 +277,7 @@ class Task(ABC):
         if not hasattr(self, "name"):
             self.name = type(self).__name__.lower()
         self.robot = robot
-        self.path = np.zeros((1, 3))
+        self.wanted = np.zeros((1, 3))
         self.axes: Array = np.asarray(robot.goal_axes, dtype=float)
         self.success_distance = robot.goal_tolerance
         self.goal_scale = 1.25 * robot.size

@@ -193,8 +193,8 @@ class Locomotion(Task):
         Args:
             ahead: control steps from now for which to return it.
         """
-        step, count = len(self._moments) - 1 + ahead, len(self.path)
-        goal = self.goals(self.path[None], np.array([count]), np.array([step]))[0]
+        step, count = len(self._moments) - 1 + ahead, len(self.wanted)
+        goal = self.goals(self.wanted[None], np.array([count]), np.array([step]))[0]
         number = min(step * count // self.horizon, count - 1)
         begun = max(-(-number * self.horizon // count) - 1, 0) if number else 0
         return goal / np.linalg.norm(goal), step - begun
