@@ -38,8 +38,8 @@ if TYPE_CHECKING:
 class HorizonConfig(RateConfig):
     """Hyperparameters of the analytic policy gradient over a short horizon."""
 
-    learning_rate: float = Field(default=0.05, gt=0)
-    final_learning_rate: float = Field(default=0.005, gt=0, description="reached linearly at the last step")
+    learning_rate: float = Field(default=0.1, gt=0)
+    final_learning_rate: float = Field(default=0.01, gt=0, description="reached linearly at the last step")
     horizon: int = Field(default=20, gt=1, description="control steps of a window")
     period: int = Field(default=10, gt=1, description="control steps of the gait")
     facing: float = Field(
