@@ -1,10 +1,11 @@
-"""Which judge decides which crawler wins? Bodies of the crawler under one gait and under gaits of their own.
+"""Which judge decides which crawler wins? The bodies of two finished searches under one gait and under their own.
 
+    softgym codesign --config crawler_walk --folder NESTED
+    softgym codesign --config studies/crawler_walk/common_gait.yaml --folder COMMON
     python studies/crawler_walk/crawl.py FOLDER NESTED COMMON
 
-NESTED and COMMON are the folders of the finished studies `crawler_walk` and `common_gait.yaml`. Bodies: seven that spread
-over the design box, and the baseline, the winner of NESTED and that of COMMON. Judges: the common gait; the gait of the
-baseline; a gait along gradients from the common one. Everything is kept in the folder; a second call resumes.
+Judges of the bodies of NESTED: the common gait, the gait of the baseline, and gaits of their own. The winner of COMMON
+gets three gaits of its own. Everything is kept in the folder; a second call resumes.
 """
 
 from __future__ import annotations
@@ -14,23 +15,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import kendalltau, qmc
+from scipy.stats import kendalltau
 
 from softgym_envs.agents.config import EnvironmentConfig, TrainConfig
 from softgym_envs.agents.evaluation import evaluate
 from softgym_envs.agents.training import train
 from softgym_envs.codesign import load_study
-from softgym_envs.robots.registry import make_robot
 from softgym_envs.runs import provenance
 from softgym_envs.storage import read_json, write_json
 
 ID = "SoftGym/CrawlerWalk-v0"
 GOAL = np.array([[0.0108, 0.0, 0.0]])
-BODIES, GRADIENTS, PERIOD = 7, 20, 25
+GRADIENTS, PERIOD = 20, 25
 OTHERS = ({"elements": 4}, {"friction": 0.4}, {"friction": 1.2})
 """A finer mesh, and other grounds."""
-PERIODS = (15, 50)
-"""Control steps of slower and faster gaits of the baseline."""
 
 
 def environment(design: dict[str, float], **robot_options: Any) -> EnvironmentConfig:
@@ -44,24 +42,15 @@ def speed(agent: str | Path, design: dict[str, float], **robot_options: Any) -> 
     return tallies | {"pressure": 1e-3 * float(found.largest_efforts[0])}
 
 
-def gait(
-    folder: Path, design: dict[str, float], seed: int = 0, period: int = PERIOD, **robot_options: Any
-) -> tuple[Path, float]:
-    """Policy of a gait along gradients, and its CPU time [s]."""
+def own(folder: Path, design: dict[str, float], seed: int = 0, period: int = PERIOD) -> dict[str, float]:
+    """Speed with a gait along gradients, and its CPU time [s]."""
     steps = 3 * period * GRADIENTS
     config = TrainConfig(
-        environment=environment(design, **robot_options), learner="gait", steps=steps, report_every=steps,
+        environment=environment(design), learner="gait", steps=steps, report_every=steps,
         evaluation_episodes=1, num_envs=1, seed=seed, gait={"period": period},
     )  # fmt: skip
     path = train(config, folder, progress=False)
-    return path, float(read_json(path.with_suffix(".json"))["cpu_seconds"])
-
-
-def winner(folder: Path) -> dict[str, float]:
-    """Design of the fastest body of a study that keeps to the limit of pressure."""
-    allowed = [trial for trial in load_study(folder).trials if trial.score is not None and trial.feasible]
-    best = max(allowed, key=lambda trial: trial.score)
-    return {name: float(value) for name, value in best.design.items()}
+    return {"cpu": float(read_json(path.with_suffix(".json"))["cpu_seconds"]), **speed(path, design)}
 
 
 def main() -> None:
@@ -69,9 +58,8 @@ def main() -> None:
     for name in ("folder", "nested", "common"):
         parser.add_argument(name, type=Path)
     given = parser.parse_args()
-    folder = given.folder
-    folder.mkdir(parents=True, exist_ok=True)
-    place = folder / "results.json"
+    given.folder.mkdir(parents=True, exist_ok=True)
+    place = given.folder / "results.json"
     data: dict[str, Any] = read_json(place) if place.exists() else {"provenance": provenance(), "rows": {}}
 
     def once(name: str, compute: Any) -> Any:
@@ -81,43 +69,33 @@ def main() -> None:
             print(name, data["rows"][name], flush=True)
         return data["rows"][name]
 
-    def own(name: str, design: dict[str, float], seed: int = 0, period: int = PERIOD, **options: Any) -> Any:
-        def compute() -> dict[str, float]:
-            path, cpu = gait(folder / name, design, seed, period, **options)
-            return {"cpu": cpu, **speed(path, design, **options)}
-
-        return once(name, compute)
-
-    space = make_robot("crawler").design_space
-    units = 2.0 * qmc.Sobol(len(space), seed=0).random(8)[:BODIES] - 1.0
-    found = {"baseline": dict(space.baseline), "nested": winner(given.nested), "common": winner(given.common)}
-    designs = found | {f"body_{k}": dict(space.from_unit(unit)) for k, unit in enumerate(units)}
-    data["designs"] = designs
-    for name, design in designs.items():
-        once(f"{name}_common_gait", lambda design=design: speed("gait", design))
-        own(f"{name}_seed_0", design)
-    baseline = folder / "baseline_seed_0" / "policy.safetensors"
-    for name, design in designs.items():
-        once(f"{name}_baseline_gait", lambda design=design: speed(baseline, design))
-    judges = {
-        judge: [data["rows"][f"{name}_{judge}"]["speed"] for name in designs]
-        for judge in ("common_gait", "baseline_gait", "seed_0")
-    }
-    data["tau"] = {
-        judge: list(kendalltau(judges[judge], judges["seed_0"])) for judge in ("common_gait", "baseline_gait")
-    }
-    for name in found:
-        own(f"{name}_seed_1", designs[name], 1)
-        own(f"{name}_seed_2", designs[name], 2)
-    for name in ("baseline", "nested"):
-        # The same gait on a finer mesh; new ones there and on other grounds.
-        path = folder / f"{name}_seed_0" / "policy.safetensors"
-        once(f"{name}_gait_on_4", lambda name=name, path=path: speed(path, designs[name], elements=4))
+    trials = load_study(given.nested).trials
+    designs = [{name: float(value) for name, value in trial.design.items()} for trial in trials]
+    allowed = [trial.number for trial in trials if trial.feasible]
+    best = max(allowed, key=lambda number: trials[number].score)
+    found = max((trial for trial in load_study(given.common).trials if trial.feasible), key=lambda trial: trial.score)
+    design = {name: float(value) for name, value in found.design.items()}
+    data |= {"designs": designs, "winner": best, "allowed": allowed, "common_design": design}
+    gaits = [given.nested / trial.controller for trial in trials]
+    for number in (0, best):
         for options in OTHERS:
-            own("_".join([name, *(f"{k}_{v}" for k, v in options.items())]), designs[name], **options)
-    for period in PERIODS:
-        own(f"baseline_period_{period}", designs["baseline"], period=period)
+            label = "_".join(f"{name}_{value}" for name, value in options.items())
+            once(f"{number}_{label}", lambda n=number, o=options: speed(gaits[n], designs[n], **o))
+    once("common_gait_of_winner", lambda: speed("gait", designs[best]))
+    once("common_gait_of_common", lambda: speed("gait", design))
+    for number, body in enumerate(designs):
+        once(f"{number}_baseline_gait", lambda body=body: speed(gaits[0], body))
+    judges = {
+        "own": [1e3 * trial.score for trial in trials],
+        "common": [1e3 * trial.qp_value for trial in trials],
+        "baseline": [data["rows"][f"{number}_baseline_gait"]["speed"] for number in range(len(trials))],
+    }
+    data["judges"] = judges
+    data["tau"] = {judge: list(kendalltau(judges[judge], judges["own"])) for judge in ("common", "baseline")}
     write_json(place, data)
+    for seed in range(3):
+        once(f"common_seed_{seed}", lambda seed=seed: own(given.folder / f"common_{seed}", design, seed))
+    once("baseline_period_50", lambda: own(given.folder / "period_50", designs[0], period=50))
 
 
 if __name__ == "__main__":
