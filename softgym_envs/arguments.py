@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import dis
 import functools
 import inspect
+import linecache
 import numbers
 import traceback
 import types
@@ -74,7 +74,7 @@ def _explained(function: Callable[..., Any], owner: str) -> Callable[..., Any]:
                 if isinstance(error, ValueError) and "\n" in str(error):
                     raise ValueError(" ".join(str(error).split())) from None
                 raise
-            if any(frame.f_globals.get("__name__", "").split(".")[0] not in _KNOWN for frame, _ in frames):
+            if any(_package(frame) not in _KNOWN for frame, _ in frames):
                 raise
             given = inspect.signature(function).bind(*args, **kwargs).arguments
             if (wrong := _wrong_argument(function, given)) is not None:
@@ -86,13 +86,15 @@ def _explained(function: Callable[..., Any], owner: str) -> Callable[..., Any]:
 
 
 def _is_raised(error: BaseException) -> bool:
-    """Whether code of the suite raised an exception on purpose."""
-    last = error.__traceback__
-    while last is not None and last.tb_next is not None:
-        last = last.tb_next
-    if last is None or not last.tb_frame.f_globals.get("__name__", "").startswith("softgym_envs"):
-        return False
-    return last.tb_frame.f_code.co_code[last.tb_lasti] == dis.opmap["RAISE_VARARGS"]
+    """Whether a statement ``raise`` of the suite raised an exception, and not an operation that failed."""
+    for frame, line in [*traceback.walk_tb(error.__traceback__)][-1:]:
+        source = linecache.getline(frame.f_code.co_filename, line, frame.f_globals)
+        return _package(frame) == "softgym_envs" and source.lstrip().startswith("raise ")
+    return False
+
+
+def _package(frame: types.FrameType) -> str:
+    return str(frame.f_globals.get("__name__", "")).split(".")[0]
 
 
 def _wrong_argument(function: Callable[..., Any], given: Mapping[str, Any]) -> str | None:

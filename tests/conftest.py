@@ -74,6 +74,12 @@ class SlowTestsWriter:
         SLOW_TESTS.write_text("\n".join([head, *lines]) + "\n")
 
 
+def pytest_ignore_collect(collection_path, config):
+    """Files with nothing but slow tests are not imported by `make check`."""
+    path = collection_path.relative_to(config.rootpath).as_posix()
+    return True if config.option.markexpr == "not slow" and path in SLOW_TESTS.read_text().splitlines() else None
+
+
 def pytest_collection_modifyitems(items):
     slow = set(SLOW_TESTS.read_text().splitlines())
     for item in items:

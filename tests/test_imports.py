@@ -75,18 +75,22 @@ def package_of(module):
     return ".".join(parts[: 3 if parts[1:2] == ["extensions"] else 2]) if len(parts) > 1 else None
 
 
+def statements(body, lazy=False):
+    """All statements in a list of them, each with whether it is inside a function."""
+    for node in body:
+        yield node, lazy
+        inside = lazy or isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+        for part in ("body", "orelse", "finalbody"):
+            yield from statements(getattr(node, part, []), inside)
+        for clause in (*getattr(node, "handlers", []), *getattr(node, "cases", [])):
+            yield from statements(clause.body, inside)
+
+
 @cache
 def imports_of(path):
     """Modules of this project that a file imports, each with its line and whether it happens inside a function only."""
     found = []
-    tree = ast.parse(path.read_text())
-    lazy = {
-        id(node)
-        for function in ast.walk(tree)
-        if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
-        for node in ast.walk(function)
-    }
-    for node in ast.walk(tree):
+    for node, lazy in statements(ast.parse(path.read_text()).body):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -97,7 +101,7 @@ def imports_of(path):
             continue
         for name in names:
             if name.split(".")[0] in ("softgym_envs", "benchmarks", "studies"):
-                found.append((name, id(node) in lazy, node.lineno))
+                found.append((name, lazy, node.lineno))
     return found
 
 

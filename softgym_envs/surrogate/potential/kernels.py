@@ -156,17 +156,6 @@ def _curvatures(index, slot, A1, A2, PT, quadratic, kept, hessian):
 
 
 @njit(**_FAST)
-def efforts(u, slot, A1, A2, P, PT, c1, c2, a, b, quadratic, linear, effort):
-    """Gradient of the energy (rows, n) at scaled actuation u (rows, n) of bodies ``slot`` (rows,)."""
-    most = min(ROWS_PER_BLOCK, len(u))
-    kept = np.empty((len(A1), 3, most, A1.shape[2]), np.float32)
-    each = np.empty((len(A1), most, u.shape[1]), np.float32)
-    for start in range(0, len(u), ROWS_PER_BLOCK):
-        rows = slice(start, start + ROWS_PER_BLOCK)
-        _gradients(u[rows], slot[rows], A1, A2, P, PT, c1, c2, a, b, quadratic, linear, kept, each, effort[rows])
-
-
-@njit(**_FAST)
 def member_efforts(u, slot, A1, A2, P, PT, c1, c2, a, b, quadratics, linears, efforts):
     """Gradients of the energies of the members (rows, members, n) at scaled actuation u (rows, n).
 

@@ -178,17 +178,12 @@ class Model(SurrogateModel):
         kernels.moved_spreads(efforts, context.slot, lever, spread)
         return spread * self.effector_scale
 
-    def _gradient(self, body: dict[str, np.ndarray], u: np.ndarray, slot: np.ndarray) -> np.ndarray:
-        effort = np.empty((len(u), self.count), dtype=np.float32)
-        coefficients = (body["c1"], body["c2"], body["a"], body["b"], body["quadratic"], body["linear"])
-        kernels.efforts(u, slot, *self._energy, *coefficients, effort)
-        return effort
-
     def _scaled(self, displacement: np.ndarray) -> np.ndarray:
         return ((displacement - self.middle) / self.half_range).astype(np.float32)
 
     def _effort(self, context: Context, displacement: np.ndarray) -> np.ndarray:
-        return self._gradient(context.arrays, self._scaled(displacement), context.slot) * self._effort_scale
+        members = self._member_efforts(context.arrays, self._scaled(displacement), context.slot)
+        return members.mean(axis=1) * self._effort_scale
 
     def _state(self, context: Context, displacement: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         return self._effort(context, displacement), *self.effector(context, displacement)
