@@ -65,7 +65,7 @@ def solve_row(W, gap, unilateral, y, a, index):
             bilateral |= 1 << i
     tolerance = 1e-12 * scale
     # Start with all taut and switch every actuator that contradicts this; two or three rounds nearly always suffice.
-    slack = np.int64(0)  # a literal 0 would be a type of its own, for which all is compiled again
+    slack = 0 * m  # the literal 0 would be a type of its own, for which all is compiled again
     for _ in range(2 * m):
         wrong = _with_slack(slack, W, gap, unilateral, tolerance, y, a, index)
         if wrong == 0:
