@@ -431,6 +431,7 @@ def test_goals_repeat_and_belong_to_the_body():
         "tetrapod_reach_analytic",
         "quadruped_walk_gait",
         "quadruped_walk_winner",
+        "quadruped_follow_horizon",
     ],
 )
 def test_shipped_policies_were_made_by_the_shipped_configs(name):
