@@ -12,7 +12,8 @@ one: searches are repeated, each below the limit that the last one left, until o
 Some commands have no equilibrium. An error exists only where there is one, so coverage is that of the other states; how
 many commands have none is reported for each stratum. The members of an ensemble may agree there, so the spread does not
 tell them. The stiffness does: where an equilibrium is nearly lost, the actuators are several times softer than at rest.
-A calibration that meets such commands therefore limits the growth of trusted states (see `Domain`).
+A calibration that meets such commands therefore limits the growth of trusted states (see `Domain`), and lowers this
+limit, too, where that costs fewer states than a lower limit of the uncertainty.
 """
 
 from __future__ import annotations
@@ -65,6 +66,9 @@ LOST = 0.01
 
 USUAL = 0.98
 """Share of the states inside whose growth is not above its limit."""
+
+GROWTHS = np.linspace(0.7, 0.98, 15)
+"""Shares of the states inside from whose growth the limit of the growth is chosen."""
 
 SEARCHES = 6
 """Most searches of a calibration."""
@@ -292,9 +296,12 @@ def fit_calibration(model: SurrogateModel, states: StratifiedStates) -> Calibrat
     return best
 
 
-def _calibrated(model: SurrogateModel, calibration: Calibration, limit: float = np.inf) -> SurrogateModel:
-    entries = {k: v for k, v in asdict(calibration).items() if np.isfinite(v)}
-    return with_domain(model, inflation=1.0, limit=limit, calibration=entries)
+def _calibrated(
+    model: SurrogateModel, calibration: Calibration, limit: float = np.inf, growth: float = np.inf
+) -> SurrogateModel:
+    entries: dict[str, Any] = {k: v for k, v in asdict(calibration).items() if np.isfinite(v)}
+    softest = {"growth": growth} if np.isfinite(growth) else {}
+    return with_domain(model, inflation=1.0, limit=limit, calibration=entries, **softest)
 
 
 def usual_growth(model: SurrogateModel, states: StratifiedStates) -> float | None:
@@ -320,6 +327,36 @@ def safe_limit(judged: Predictions, tolerance: float) -> float:
     """
     wrong = judged.trusted & (~judged.found | (judged.error > tolerance))
     return min(tolerance, SAFETY * float(judged.uncertainty[wrong].min(initial=np.inf)))
+
+
+def safe_bounds(
+    judged: Predictions, stratum: np.ndarray, tolerance: float, growth: float, limit: float
+) -> tuple[float, float]:
+    """Return the largest growth and uncertainty to be trusted, below both of which no judged state is wrong.
+
+    Commands without an equilibrium are soft, and the spread hardly tells them. With the growth limited a little more,
+    they need not lower the limit of the uncertainty. Of the pairs that leave no wrong state, this is the one with the
+    largest share of trusted states in the strata.
+
+    Args:
+        judged: by a model without a limit.
+        stratum: of these states, shape (N,).
+        tolerance: largest error of a trusted state [m].
+        growth: largest growth to be considered, infinite for a robot that does not buckle.
+        limit: likewise of the uncertainty [m].
+    """
+    drawn, best, most = stratum != "adversarial", (growth, 0.0), -1.0
+    candidates = [growth]
+    if np.isfinite(growth):
+        inside = judged.growth[(stratum == "inside") & judged.found]
+        candidates += [float(g) for g in np.quantile(inside, GROWTHS) if g < growth]
+    for softest in candidates:
+        kept = replace(judged, trusted=judged.trusted & (judged.growth <= softest))
+        lowest = min(limit, safe_limit(kept, tolerance))
+        share = float((kept.trusted & (kept.uncertainty <= lowest))[drawn].mean())
+        if share > most:
+            best, most = (softest, lowest), share
+    return best
 
 
 def calibrate(
@@ -352,8 +389,11 @@ def calibrate(
             f"'{folder}': only an ensemble of two or more members can be calibrated; "
             f"these weights have one member of kind '{model.network}'"
         )
-    if model.card.get("calibration", {}).get("limits_growth"):  # the last calibration did, not the training
+    last = model.card.get("calibration", {})
+    if last.get("limits_growth"):  # the last calibration did, not the training
         model = with_domain(model, growth=np.inf)
+    elif last.get("growths"):  # the last calibration lowered that of the training
+        model = with_domain(model, growth=last["trained_growth"])
     known = judged_states(model, bodies, states, seed, state_folder, kept_only, workers)
     limits_growth = False
     if not model.domain.limits_growth and (growth := usual_growth(model, known)) is not None:
@@ -363,14 +403,19 @@ def calibrate(
     calibration = fit_calibration(model, known)
     unlimited, everything = _calibrated(model, calibration), known
     limits: list[float] = []  # below which searches were made
-    limit = safe_limit(predict(unlimited, known), robot.goal_tolerance)
-    while adversarial_states and len(limits) < SEARCHES and (not limits or limit < (1.0 - ROUNDING) * limits[-1]):
+    growths: list[float] = []
+    tolerance = robot.goal_tolerance
+    growth, limit = safe_bounds(predict(unlimited, known), known.stratum, tolerance, model.domain.growth, tolerance)
+    while adversarial_states and len(limits) < SEARCHES:
+        if limits and limit >= (1.0 - ROUNDING) * limits[-1] and growth >= (1.0 - ROUNDING) * growths[-1]:
+            break
         limits.append(limit)
-        limited = _calibrated(model, calibration, limit)
+        growths.append(growth)
+        limited = _calibrated(model, calibration, limit, growth)
         found_states = adversarial_search(limited, adversarial_states, states, seed, state_folder, len(limits), workers)
         everything = StratifiedStates.join([everything, found_states])
-        limit = safe_limit(predict(unlimited, everything), robot.goal_tolerance)
-    model = _calibrated(model, calibration, limit)
+        growth, limit = safe_bounds(predict(unlimited, everything), everything.stratum, tolerance, growth, limit)
+    model = _calibrated(model, calibration, limit, growth)
     found = report(model, everything)
     card_path = Path(folder) / "model.json"
     card = json.loads(card_path.read_text())
@@ -382,6 +427,7 @@ def calibrate(
     card["calibration"] = {
         "bodies": bodies, "states": states, "adversarial_states": adversarial_states, "seed": seed,
         "kept_only": kept_only, "limits": limits, "limits_growth": limits_growth,
+        **({"growths": growths, "trained_growth": unlimited.domain.growth} if model.domain.limits_growth else {}),
         "strata": {name: asdict(row) for name, row in found.items()},
     }  # fmt: skip
     write_json(card_path, card)
@@ -445,9 +491,10 @@ def calibration_states(model: SurrogateModel, folder: str | Path) -> StratifiedS
         return known
     if "limits" not in made:  # calibrated before searches were repeated
         made = {**made, "limits": [model.robot.goal_tolerance], "first": 0}
+    softest = made.get("growths", [model.domain.growth] * len(made["limits"]))
     searched = [
-        adversarial_search(with_domain(model, limit=limit), made["adversarial_states"], *sizes, number)
-        for number, limit in enumerate(made["limits"], start=made.get("first", 1))
+        adversarial_search(_calibrated(model, model.domain.calibration, *bounds), made["adversarial_states"], *sizes, n)
+        for n, bounds in enumerate(zip(made["limits"], softest, strict=True), start=made.get("first", 1))
     ]
     return StratifiedStates.join([known, *searched])
 

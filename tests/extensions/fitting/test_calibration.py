@@ -23,6 +23,7 @@ from softgym_envs.extensions.fitting.calibration import (
     predict,
     reached,
     report,
+    safe_bounds,
     safe_limit,
     with_domain,
 )
@@ -427,6 +428,20 @@ def test_searches_go_on_below_the_limit_that_the_last_one_left(trunk, tmp_path, 
     card = load_model(folder, trunk.robot).card
     assert limits[0] == trunk.robot.goal_tolerance > limits[1] > 0.0 and len(limits) == 2
     assert card["calibration"]["limits"] == limits and card["domain"]["limit"] == pytest.approx(limits[1], rel=1e-4)
+
+
+def test_a_soft_command_without_an_equilibrium_costs_growth_rather_than_uncertainty():
+    """A hundred good states and a lost one, which is softer than nearly all of them but has a small spread."""
+    found = np.arange(101) < 100
+    growth = np.append(np.linspace(1.0, 2.0, 100), 1.9)
+    uncertainty = np.append(np.full(100, 5e-4), 1e-4)
+    judged = Predictions(np.full(101, 1e-4), uncertainty, uncertainty, np.full(101, True), growth, found)
+    stratum = np.full(101, "inside")
+    softest, limit = safe_bounds(judged, stratum, 2e-3, 2.0, 2e-3)
+    assert 1.8 < softest < 1.9 and limit == 2e-3
+    # A body that does not buckle has the other limit only, and bounds are never above those that were searched.
+    assert safe_bounds(judged, stratum, 2e-3, np.inf, 2e-3) == (np.inf, pytest.approx(0.8e-4))
+    assert safe_bounds(judged, stratum, 2e-3, 1.5, 7e-4) == (1.5, 7e-4)
 
 
 def test_a_new_calibration_sets_its_own_limit_of_growth(trunk, tmp_path, monkeypatch):
