@@ -27,6 +27,9 @@ from softgym_envs.robots.geometry.symmetry import Symmetry
 from softgym_envs.robots.mesh_tiers import MeshTier
 from softgym_envs.robots.soft_finger import FINGER_MESHES, TIP_RADIUS, SoftFinger
 
+Placements = tuple[tuple[np.ndarray, tuple[float, float, float]], ...]
+"""Rotation (3, 3) and shift [m] of each finger."""
+
 STRAIGHT = np.eye(3)
 TURNED = np.diag([-1.0, -1.0, 1.0])
 """Half a turn about z: the finger then bends towards -y."""
@@ -65,8 +68,8 @@ class FingerRobot(Robot):
     """
 
     size = 0.12
-    #: Rotation and shift [m] of each finger.
-    placements: tuple[tuple[np.ndarray, tuple[float, float, float]], ...]
+    #: Rotation and shift [m] of each finger; where they depend on the design, as many as a body can have.
+    placements: Placements
     #: Range of the cables and their largest change in a control step [m].
     cable_range = (0.0, 0.020)
     cable_rate = 0.001
@@ -131,6 +134,10 @@ class FingerRobot(Robot):
         """Return the position of the rigid object [m], shape (3,), or None if there is none."""
         return None
 
+    def arrangement(self, design: Mapping[str, float]) -> Placements:
+        """Return where the fingers of a design are."""
+        return self.placements
+
     def add_object(self, assembly: ModelBuilder, design: Mapping[str, float]) -> int | None:
         """Add the rigid object and return the first row of its frame, or None if there is none."""
         position = self.object_frame(design)
@@ -140,10 +147,11 @@ class FingerRobot(Robot):
         """Place the fingers, route their cables, and tie them to the object."""
         names = self.finger.design_space.names
         self._shape = {name: design[name] for name in names}
+        self._arranged = self.arrangement(design)
         mesh = self.finger.body(self._shape)
         fixed = in_flange(mesh.nodes)
         assembly = ModelBuilder(gravity=self.gravity, floating=self.holds_by_contact)
-        for turn, shift in self.placements:
+        for turn, shift in self._arranged:
             assembly.add_solid(
                 mesh.nodes @ turn.T + shift,
                 mesh.tetrahedra,
@@ -156,7 +164,7 @@ class FingerRobot(Robot):
         frame = self.add_object(assembly, design)
         model = assembly.build()
         cables = iter(self.actuators)
-        for k, (turn, shift) in enumerate(self.placements):
+        for k, (turn, shift) in enumerate(self._arranged):
             for pull_point, points in self.finger.routes(self._shape):
                 cable = next(cables)
                 model.add_cable(
@@ -183,7 +191,7 @@ class FingerRobot(Robot):
             reference: the same point of the reference body, which selects the element for points outside the mesh.
             radius: of the part of the finger on which the point acts [m], unless cables act on single points.
         """
-        turn, shift = self.placements[finger]
+        turn, shift = self._arranged[finger]
         hint = self.finger.reference_element(self._mesh, reference)
         radius = radius if self.guide_radius else 0.0
         return model.embed(turn @ point + shift, hint, block=finger, radius=radius)
@@ -192,7 +200,7 @@ class FingerRobot(Robot):
         """Tie the three contact points of each finger to the points of the object that they touch at rest."""
         reference = self.finger.contact_points(self.finger.reference_design)
         centre = model.nodes[frame]
-        for k in range(len(self.placements)):
+        for k in range(len(self._arranged)):
             for i, point in enumerate(self.finger.contact_points(self._shape)):
                 embedding = self.material_point(model, k, point, reference[i], radius=self.guide_radius)
                 held = EmbeddedPoints.in_frame(frame, embedding.points[0] - centre, model.nodes)

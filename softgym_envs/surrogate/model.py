@@ -195,6 +195,10 @@ class SurrogateModel(ABC):
         """Return only the effectors [m] (B, n_e) and their spread [m] (B,), at displacements (B, n_a)."""
         return self._state(context, displacement)[1:]
 
+    def member_efforts(self, context: Context, displacement: np.ndarray) -> np.ndarray:
+        """Return the efforts of each member of an ensemble (M, B, n_a) at displacements (B, n_a)."""
+        return self.effort(context, displacement)[None]
+
     def force_spread(self, context: Context, displacement: np.ndarray) -> np.ndarray:
         """Return how far an effector would move [m] (B,) by what the members' efforts differ at displacements (B, n_a).
 

@@ -1,4 +1,4 @@
-"""Grippers: against coupled models of single fingers, finite differences, balance of forces, symmetry, designs.
+"""Grippers: against single fingers that are tied, finite differences, balance of forces, symmetry, designs.
 
 The meshes are coarse: the tested properties hold for any mesh.
 """
@@ -12,7 +12,6 @@ import pytest
 
 from softgym_envs import make_robot
 from softgym_envs.errors import DesignError
-from softgym_envs.extensions.grasping.control.coupling import HeldObject, couple, rotate, tie_points
 from softgym_envs.mechanics.frames import rotation_of
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.soft_finger import SoftFinger
@@ -64,74 +63,42 @@ def tips(model, x):
     return np.array([bond.first.weights[0] @ x[bond.first.node_ids[0] + shift] for shift in (0, count)])
 
 
-# -- against coupled single fingers ---------------------------------------------------------------------------------
-
-
-def single_finger(robot):
-    finger = SoftFinger(
-        cables=2,
-        mesh_size=robot.finger.mesh_size,
-        unilateral=bool(robot.unilateral.all()),
-        contacts=robot.name != "two_finger_gripper",
-    ).build()
-    if robot.name == "two_finger_gripper":
-        finger.add("c", finger.constraints["e"][0])  # so that the tie can drive the tip
-    return finger
-
-
-def part_models(robot, state, points):
-    """Condensed models of the fingers, each solved alone with its contact points (k, 3) [m] where they are held."""
-    finger, models = single_finger(robot), []
-    for k, (turn, shift) in enumerate(robot.placements):
-        local = (np.split(points, len(robot.placements))[k] - shift) @ turn
-        part = Statics(finger, tolerance=1e-13).solve(
-            state.delta[2 * k : 2 * k + 2], contact=local.ravel(), contact_mode="displacement"
-        )
-        count = len(finger.nodes)
-        np.testing.assert_allclose(part.x @ turn.T + shift, state.x[k * count : (k + 1) * count], atol=1e-10)
-        models.append(rotate(part.condensed, turn, shift))
-    return models
-
-
-def agrees(found, state):
-    """W, free shape and efforts to 1e-8 of the largest entry of each block."""
-    expected = state.condensed
-    for block in ("aa", "ea", "ee"):
-        W = getattr(expected.W, block)
-        np.testing.assert_allclose(getattr(found.W, block), W, rtol=0, atol=1e-8 * np.abs(W).max(), err_msg=block)
-    np.testing.assert_allclose(found.free, expected.free, rtol=0, atol=1e-8 * np.abs(expected.free).max())
-    np.testing.assert_allclose(found.effort, expected.effort, rtol=0, atol=1e-8 * max(1.0, expected.effort.max()))
-
-
-@pytest.mark.parametrize("name", ["three_finger_gripper", "press_finger"])
-@pytest.mark.parametrize("pulled", [False, True], ids=["rest", "pulled"])
-def test_coupled_fingers_hold_the_object_as_one_model_does(grippers, name, pulled):
-    """Eq. 4.8 to 4.10 on the fingers' own models agree with one model of all bodies."""
-    robot, model = grippers(name, unilateral=False)
-    statics, state = solved((robot, model), pulled * COMMANDS[name])
-    points = contacts(model, state.x)
-    frame = model.frames.rows[0]
-    turn, centre = rotation_of(state.x, frame), state.x[frame]
-    models = part_models(robot, state, points)
-    load = np.append(model.nodal_loads[frame], np.zeros(3))
-    coupled = couple(models, body=HeldObject(centre, (points - centre) @ turn, rotation=turn, load=load))
-    assert coupled.dropped == 0
-    agrees(coupled.condensed, state)
-    np.testing.assert_allclose(coupled.motion(state.effort[: len(robot.actuators)]), 0.0, atol=1e-9)
+# -- against single fingers -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("pulled", [False, True], ids=["rest", "pulled"])
 def test_tied_fingers_pinch_as_one_model_does(grippers, pulled):
+    """Fingers solved alone, with their tips where they are held, and tied: ``C (W (f + C^T m) + free) = d``."""
     robot, model = grippers("two_finger_gripper", unilateral=False)
     _, state = solved((robot, model), pulled * COMMANDS[robot.name])
-    models = part_models(robot, state, tips(model, state.x))
-    ties = tie_points(models, (0, "c", 0), (1, "c", 0))
-    both = couple(models, ties, np.array([0.0, 0.040, 0.0]), effectors=[0, 1]).condensed
+    finger = SoftFinger(cables=2, mesh_size=robot.finger.mesh_size, unilateral=False).build()
+    finger.add("c", finger.constraints["e"][0])  # so that the tie can drive the tip
+    count, W, free, C = len(finger.nodes), np.zeros((16, 16)), np.zeros(16), np.zeros((3, 16))
+    for k, (turn, shift) in enumerate(robot.placements):
+        local = (tips(model, state.x)[k] - shift) @ turn
+        part = Statics(finger, tolerance=1e-13).solve(
+            state.delta[2 * k : 2 * k + 2], contact=local, contact_mode="displacement"
+        )
+        np.testing.assert_allclose(part.x @ turn.T + shift, state.x[k * count : (k + 1) * count], atol=1e-10)
+        # Cables, effector and the same point as a contact: rotated, the last two shifted.
+        whole = np.eye(8)
+        whole[2:5, 2:5] = whole[5:, 5:] = turn
+        rows = slice(8 * k, 8 * k + 8)
+        W[rows, rows] = whole @ part.condensed.compliance @ whole.T
+        free[rows] = whole @ part.condensed.free + np.concatenate([np.zeros(2), shift, shift])
+        C[:, rows.stop - 3 : rows.stop] = (2 * k - 1) * np.eye(3)
+    held = W - W @ C.T @ np.linalg.solve(C @ W @ C.T, C @ W)
+    closed = free + W @ C.T @ np.linalg.solve(C @ W @ C.T, [0.0, 0.040, 0.0] - C @ free)
     # The effector is the middle of the two tips.
-    mean = np.zeros((7, 10))
-    mean[:4, :4], mean[4:, 4:7], mean[4:, 7:] = np.eye(4), 0.5 * np.eye(3), 0.5 * np.eye(3)
-    middle = type(both)(mean @ both.compliance @ mean.T, mean @ both.free, mean @ both.effort, (("a", 4), ("e", 3)))
-    agrees(middle, state)
+    chosen = np.zeros((7, 16))
+    chosen[[0, 1, 2, 3], [0, 1, 8, 9]] = 1.0
+    chosen[4:, 2:5] = chosen[4:, 10:13] = 0.5 * np.eye(3)
+    expected = state.condensed
+    found = type(expected)(chosen @ held @ chosen.T, chosen @ closed, expected.effort, expected.roles)
+    for block in ("aa", "ea", "ee"):
+        largest = np.abs(getattr(expected.W, block)).max()
+        np.testing.assert_allclose(getattr(found.W, block), getattr(expected.W, block), rtol=0, atol=1e-8 * largest)
+    np.testing.assert_allclose(found.free, expected.free, rtol=0, atol=1e-8 * np.abs(expected.free).max())
 
 
 # -- W --------------------------------------------------------------------------------------------------------------

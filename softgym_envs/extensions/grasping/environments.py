@@ -1,8 +1,9 @@
-"""Environments of contact-aided fingers."""
+"""Environments of grippers of any number of fingers, and of contact-aided fingers."""
 
 from softgym_envs.envs.registration import EnvironmentRow
 
 ENVIRONMENTS = {
+    "SoftGym/ComposedGripperManipulate-v0": EnvironmentRow("composed_gripper", "track", 100, "surrogate"),
     "SoftGym/FingerGrasp-v0": EnvironmentRow("grasping_finger", "grasp", 25, "surrogate"),
     "SoftGym/GripperLift-v0": EnvironmentRow(
         "contact_aided_gripper",

@@ -28,6 +28,10 @@ class StrainRates(NamedTuple):
     damping: float
 
 
+NO_ENTRIES = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0)
+"""Rows, columns and values of an empty matrix."""
+
+
 def lower_pairs(dofs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pairs of the lower triangles, each (m, k (k + 1) / 2), of elements with degrees of freedom ``dofs`` (m, k)."""
     r, s = np.tril_indices(dofs.shape[1])
@@ -150,3 +154,39 @@ class ElementBlock(ABC):
     @abstractmethod
     def laplacian_entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Rows, columns and values of the Laplacian that warping solves, each of shape (k,)."""
+
+
+class Massless(ElementBlock):
+    """Elements that store energy but have neither mass nor viscosity; steps are warped by what is around them."""
+
+    volume = 0.0
+    mass = 0.0
+    stiffness = 0.0
+
+    def add_damping(
+        self,
+        x: np.ndarray,
+        rates: StrainRates,
+        gradient: np.ndarray,
+        values: np.ndarray | None,
+        scatter: list[np.ndarray] | None,
+    ) -> float:
+        return 0.0
+
+    def nodal_masses(self, count: int) -> np.ndarray:
+        return np.zeros(count)
+
+    def mass_entries(self, lumped: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return NO_ENTRIES
+
+    def add_warped(self, x: np.ndarray, step: np.ndarray, out: np.ndarray) -> None:
+        """Nothing of these elements is warped."""
+
+    def laplacian_entries(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return NO_ENTRIES
+
+
+def add_entries(values: np.ndarray, places: np.ndarray, entries: np.ndarray) -> None:
+    """Add entries to ``values`` at places of the same size, where these are not negative."""
+    kept = places.ravel() >= 0
+    np.add.at(values, places.ravel()[kept], entries.ravel()[kept])

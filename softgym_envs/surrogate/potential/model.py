@@ -171,6 +171,11 @@ class Model(SurrogateModel):
         kernels.member_efforts(u, slot, *self._energy, *coefficients, efforts)
         return efforts
 
+    def member_efforts(self, context: Context, displacement: np.ndarray) -> np.ndarray:
+        """Return the efforts of each member [N, ...] (M, B, n_a) at displacements (B, n_a)."""
+        found = self._member_efforts(context.arrays, self._scaled(displacement), context.slot)
+        return found.swapaxes(0, 1) * self._effort_scale * context.stiffness[context.slot]
+
     def force_spread(self, context: Context, displacement: np.ndarray) -> np.ndarray:
         body, spread = context.arrays, np.empty(len(displacement), dtype=np.float32)
         efforts = self._member_efforts(body, self._scaled(displacement), context.slot)
