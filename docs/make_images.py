@@ -80,8 +80,7 @@ WALKERS = {"baseline": "quadruped_walk_gait", "winner": "quadruped_walk_winner"}
 STRIP, WALKED = (800, 170), 5.5
 """Size of the picture of a walker [pixels], and the way that it shows [sizes of the robot]."""
 OPTIONS: dict[str, dict[str, Any]] = {
-    # Learned fingers are drawn as bars.
-    "composed_gripper_manipulate": {"backend": "fem", "design": {"fingers": "2+2", "angle": 0.4}},
+    "composed_gripper_manipulate": {"design": {"fingers": "2+2", "angle": 0.4}},
     "finger_grasp": {"backend": "fem", "robot_options": {"object": "hexagon"}},  # easier to see than a plane
     "modular_reach": {"backend": "fem", "robot_options": {"body": "solid"}},  # superelements are drawn as bars
 }

@@ -306,7 +306,7 @@ def test_what_learned_fingers_cannot_do_is_refused(backend):
 @pytest.mark.parametrize("fingers", list(ARRANGEMENTS))
 def test_the_inverse_controller_moves_the_object(fingers):
     """From goal to goal of the reference path, as far as cables that only pull can go."""
-    env = gymnasium.make(ID, task="reach", disable_env_checker=True).unwrapped
+    env = gymnasium.make(ID, backend="surrogate", disable_env_checker=True).unwrapped
     env.reset(seed=0, options={"design": {"fingers": fingers, "spacing": 0.05}})
     controller = InverseQP.for_robot(env.robot)
     state = env.backend.state
