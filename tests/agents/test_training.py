@@ -429,6 +429,7 @@ def test_goals_repeat_and_belong_to_the_body():
         "tetrapod_carry",
         "tetrapod_carry_kilogram",
         "tetrapod_reach_analytic",
+        "crawler_walk_gait",
         "quadruped_walk_gait",
         "quadruped_walk_winner",
         "quadruped_follow_horizon",
