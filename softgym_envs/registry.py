@@ -10,6 +10,7 @@ import os
 import re
 import types
 from collections.abc import Iterator, Mapping
+from difflib import get_close_matches
 from functools import cache, partial
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -32,6 +33,9 @@ class Table(Mapping[str, Any]):
         group: group of entry points; none by default.
     """
 
+    _other = ""
+    """What may be given in place of a name, for messages."""
+
     def __init__(self, kind: str, entries: Mapping[str, Any], *, group: str = "") -> None:
         self.kind = kind
         self._entries: dict[str, Any] = dict(entries)
@@ -45,7 +49,7 @@ class Table(Mapping[str, Any]):
             ValueError: for an unknown name, one that two packages claim, or an object of the wrong kind.
         """
         if name not in self:
-            raise ValueError(unknown_name(self.kind, name, self))
+            raise ValueError(unknown_name(self.kind, name, self, other=self._other))
         return self[name]
 
     def place(self, name: str) -> str:
@@ -103,6 +107,8 @@ class Registry(Table):
         base: ``"module:class"`` that every entry must be derived from.
         group: group of entry points; none by default.
     """
+
+    _other = "one of your own as 'module:Class'"
 
     def __init__(self, kind: str, entries: Mapping[str, str], *, base: str, group: str = "") -> None:
         super().__init__(kind, entries, group=group)
@@ -227,7 +233,9 @@ def import_object(kind: str, path: str) -> Any:
     if not name:
         return module
     if not hasattr(module, name):
-        raise ValueError(f"{kind} '{path}': module '{name_of_module}' has no '{name}'")
+        near = get_close_matches(name, [each for each in vars(module) if not each.startswith("_")], n=1)
+        hint = f"; did you mean '{near[0]}'?" if near else ""
+        raise ValueError(f"{kind} '{path}': module '{name_of_module}' has no '{name}'{hint}")
     return getattr(module, name)
 
 

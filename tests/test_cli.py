@@ -186,7 +186,12 @@ STRENGTH = "configs/design/finger_strength.yaml"
         (["frobnicate"], ["frobnicate", "rollout"]),
         (["rolout"], ["unknown verb 'rolout'; did you mean 'rollout'?"]),
         (["bench", "nothing"], ["nothing"]),
-        (["show", "finegr"], ["unknown robot 'finegr'; did you mean 'finger'?"]),
+        (["show", "finegr"], ["unknown robot 'finegr'; did you mean 'finger'?", "one of your own as 'module:Class'"]),
+        (["show", "softgym_envs.robots.soft_finger:Softfinger"], ["has no 'Softfinger'; did you mean 'SoftFinger'?"]),
+        (
+            ["rollout", "softgym_envs.robots.soft_finger:SoftFinger"],
+            ["a robot is given as --robot softgym_envs."],
+        ),
         (["show", "SoftGym/FingerReach-v0"], ["'SoftGym/FingerReach-v0' is an environment; its robot is 'finger'"]),
         (["show", "finger", "--option", "cabels=1"], ["unknown option 'cabels'; did you mean 'cables'? allowed: "]),
         (["show", "finger", "--option", "cables=two"], ["cables = 'two' must be an integer"]),

@@ -203,7 +203,7 @@ MISTAKES = {
     ),
     "robot": (
         lambda _: make_robot("fingr"),
-        "unknown robot 'fingr'; did you mean 'finger'?",
+        "unknown robot 'fingr'; did you mean 'finger'? allowed too: one of your own as 'module:Class'",
     ),
     "robot option": (
         lambda _: make_robot("finger", cabels=1),
@@ -219,7 +219,8 @@ MISTAKES = {
     ),
     "backend": (
         lambda _: gymnasium.make(REACH, backend="femm"),
-        "unknown backend 'femm'; did you mean 'fem'? allowed: fem, surrogate, hardware, hybrid",
+        "unknown backend 'femm'; did you mean 'fem'? allowed: fem, surrogate, hardware, hybrid, or one of your own as "
+        "'module:Class'",
     ),
     "task option": (
         lambda _: gymnasium.make(REACH, task_options={"spred": 0.1}),

@@ -101,9 +101,11 @@ def _registered(id: str) -> str:
         return id
     sys.path.append(os.getcwd())
     try:
-        importlib.import_module(module)
+        imported = importlib.import_module(module)
     except ModuleNotFoundError as error:
         raise ConfigError(f"environment '{id}': module '{module}' cannot be imported: {error}") from None
+    if isinstance(getattr(imported, name, None), type):
+        raise ConfigError(f"'{id}' is a class, not the ID of an environment; a robot is given as --robot {id}")
     return name
 
 

@@ -132,7 +132,7 @@ def test_the_history_follows_the_direction_of_the_first_objective(study, seconda
     snapshot = load_study(folder)
     figures = dict(search_figures(snapshot, collect(snapshot)))
     history = {trace.name: list(trace.y) for trace in figures["Every trial, and the best so far"].data}
-    assert history["Best Value"] == [50.0, 50.0, 75.0, 75.0]
+    assert history["best so far"] == [50.0, 50.0, 75.0, 75.0]
     assert ("Several objectives" in figures) == bool(secondary)
 
 

@@ -178,6 +178,7 @@ def _of_trials(snapshot: StudySnapshot, results: StudyResults) -> Iterator[tuple
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         history = styled(visualization.plot_optimization_history(study, **named), 360)
+        history.update_traces(name="best so far", selector={"name": "Best Value"})
         shown.mark(history, lambda trial: trial.number, lambda trial: shown.values(trial)[0])
         yield "Every trial, and the best so far", history
         for start in range(0, len(shown.names), WIDE):

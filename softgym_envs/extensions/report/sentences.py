@@ -48,7 +48,7 @@ def headline(snapshot: StudySnapshot, results: StudyResults) -> str:
     if not results.comparison:
         return f"Trial {winner.trial} scored best. There is no comparison: {why_untested(snapshot, results)}."
     row, measure = results.comparison[0], snapshot.config.distance
-    scale = snapshot.config.distance_scale
+    scale, rate = snapshot.config.distance_scale, snapshot.config.shown_objectives["success_rate"]
     sentences = [
         _finding(snapshot, row),
         f"On {BACKENDS[row.backend]}, with {'its own policy' if row.agent == 'policy' else 'the inverse QP'}, its "
@@ -57,7 +57,8 @@ def headline(snapshot: StudySnapshot, results: StudyResults) -> str:
         f"(difference {measure.text(row.distance_change, '+')}"
         f"{_interval(row.distance_change_interval, measure, row.distance_mesh)}). It reaches "
         f"{percent(row.winner.success_rate)} of the goals with a final {scale.name} of at most "
-        f"{scale.limit_text(results.success_distance)}, the baseline {percent(row.baseline.success_rate)}.",
+        f"{scale.limit_text(results.success_distance)}, the baseline {percent(row.baseline.success_rate)} "
+        f"(difference {rate.text(row.success_change, '+')}{_interval(row.success_change_interval, rate)}).",
         results.few_goals,
     ]
     return " ".join(sentence for sentence in sentences if sentence)
