@@ -29,7 +29,7 @@ def export_body(
         robot: the family of bodies.
         path: ends with ``.step`` (the exact shape) or ``.stl`` (the boundary of its finite-element mesh).
         design: the body; missing variables take their baseline.
-        time_limit: wall-clock limit for drawing a STEP file [s].
+        time_limit: limit of the CPU time of drawing a STEP file [s].
 
     Returns:
         The path.
@@ -64,7 +64,7 @@ def write_drawing(drawing: Drawing, path: str | Path, *, mesh_size: float = 0.00
         drawing: the function and its parameters.
         path: ends with ``.step`` or ``.stl``.
         mesh_size: largest edge of the triangles of an STL [m]; round parts have shorter edges.
-        time_limit: wall-clock limit [s].
+        time_limit: limit of the CPU time [s].
 
     Raises:
         InfeasibleDesign: if the volume cannot be drawn, or takes too long.

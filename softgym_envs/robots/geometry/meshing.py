@@ -14,6 +14,7 @@ import inspect
 import json
 import os
 import pickle
+import signal
 import subprocess
 import sys
 import tempfile
@@ -33,6 +34,9 @@ from softgym_envs.storage import atomic_write, cache_directory, read_npz
 
 _FORMAT = 2
 # Exit statuses of the meshing process: gmsh is missing or does not load; gmsh rejects the shape; the drawing has a bug.
+_HUNG = 20.0
+"""Wall time of a meshing process over its limit of CPU time, after which it is taken for hung."""
+
 _NO_GMSH, _NO_SHAPE, _BUG = 3, 4, 5
 _SHIPPED = Path(__file__).parents[1] / "meshes"
 
@@ -165,7 +169,7 @@ def mesh_geometry(
         uses: other functions that the drawing calls; editing them makes a new mesh, as editing the drawing does.
         key: what the mesh follows from besides its size, as JSON data, instead of the function and its parameters. An
             empty one: the mesh is not kept.
-        time_limit: wall-clock limit of the meshing process [s].
+        time_limit: limit of the CPU time of the meshing process [s], so that no body fails on a busy machine.
 
     Raises:
         InfeasibleDesign: if gmsh cannot draw or mesh the geometry, or takes too long.
@@ -247,7 +251,7 @@ def run_gmsh(request: dict, *, time_limit: float) -> None:
     Args:
         request: the function ``build``, its ``parameters``, ``mesh_size`` [m] and ``output``: a path that ends with
             .npz (a `BodyMesh`), .step (the exact shape, in mm) or .stl (its surface, in mm).
-        time_limit: wall-clock limit of the process [s].
+        time_limit: limit of its CPU time [s].
 
     Raises:
         InfeasibleDesign: if gmsh cannot draw or mesh the geometry, or takes too long.
@@ -256,15 +260,15 @@ def run_gmsh(request: dict, *, time_limit: float) -> None:
     import cloudpickle  # also takes functions of scripts and notebooks
 
     command = [sys.executable, "-m", "softgym_envs.robots.geometry.meshing"]
-    given = cloudpickle.dumps(request)
+    given = cloudpickle.dumps({**request, "time_limit": time_limit})
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
-    parameters = request["parameters"]
+    parameters, hung = request["parameters"], max(600.0, _HUNG * time_limit)
     try:
-        done = subprocess.run(
-            command, input=given, capture_output=True, timeout=time_limit, env=environment, check=False
-        )
+        done = subprocess.run(command, input=given, capture_output=True, timeout=hung, env=environment, check=False)
     except subprocess.TimeoutExpired:
-        raise InfeasibleDesign(f"meshing took longer than {time_limit:g} s for {parameters}") from None
+        raise InfeasibleDesign(f"meshing did not end in {hung:g} s for {parameters}") from None
+    if done.returncode == -signal.SIGPROF:
+        raise InfeasibleDesign(f"meshing took longer than {time_limit:g} s of CPU time for {parameters}")
     if done.returncode == 0:
         return
     text = done.stderr.decode(errors="replace").strip()
@@ -344,7 +348,9 @@ def _draw_here(request: dict) -> None:
 def _main() -> int:
     """Run as the meshing process; return its exit status."""
     try:
-        _draw_here(pickle.load(sys.stdin.buffer))
+        request = pickle.load(sys.stdin.buffer)
+        signal.setitimer(signal.ITIMER_PROF, request["time_limit"])  # ends the process, whatever code it is in
+        _draw_here(request)
     except (ImportError, OSError) as problem:  # OSError: a system library that gmsh needs is missing
         print(explain(problem) or problem, file=sys.stderr)
         return _NO_GMSH
