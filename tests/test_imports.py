@@ -28,7 +28,7 @@ LAYERS = [
     {"softgym_envs.robots"},
     {"softgym_envs.surrogate"},
     {"softgym_envs.backends"},
-    {"softgym_envs.control", "softgym_envs.extensions.sensing"},
+    {"softgym_envs.control"},
     {"softgym_envs.envs"},
     {"softgym_envs.agents"},
     {"softgym_envs.codesign"},
