@@ -16,6 +16,7 @@ from softgym_envs.extensions.report.episodes import typical_goal
 from softgym_envs.extensions.report.figures import search_figures
 from softgym_envs.extensions.report.findings import findings
 from softgym_envs.extensions.report.motion import goal_outcomes, goal_views
+from softgym_envs.extensions.report.sentences import headline
 from softgym_envs.extensions.report.tables import effort_rows
 from softgym_envs.viewer.video import write_video
 from softgym_envs.wording import time_text
@@ -176,6 +177,13 @@ def test_plots_show_every_complete_trial(tested):
         assert trace.x[0] == pytest.approx(1e3 * design[name])
     assert len(marks) == 2
     assert "Bodies and their objective" in drawn
+
+
+def test_the_headline_says_how_certain_the_change_in_success_is(tested):
+    snapshot = tested(FAR, NEAR)
+    text = headline(snapshot, collect(snapshot))
+    assert "It reaches 0.0 % of the goals" in text
+    assert "the baseline 16.7 % (difference -16.7 pp, 95 % interval -" in text
 
 
 def test_efforts_stand_in_the_report(tested):
