@@ -316,7 +316,7 @@ class ThreeFingerGripper(FingerRobot):
 
     name = "three_finger_gripper"
     effectors = ("cube",)
-    placements = (
+    placements: Placements = (
         (STRAIGHT, (0.0, 0.0, 0.0)),
         (TURNED, (-0.030, 0.070, 0.0)),
         (TURNED, (0.030, 0.070, 0.0)),
