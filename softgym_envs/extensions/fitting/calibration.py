@@ -22,7 +22,7 @@ import copy
 import itertools
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,7 @@ from softgym_envs.extensions.fitting.data.strata import (
     solve_commands,
     strata_of,
 )
+from softgym_envs.extensions.fitting.predictions import Predictions, StratumReport, by_stratum, predict, reached, report
 from softgym_envs.robots.base import Robot
 from softgym_envs.storage import write_json
 from softgym_envs.surrogate.domain import Calibration
@@ -56,10 +57,6 @@ FACTOR_OF = {
     "near buckling": "buckling",
 }
 """Entry of `Calibration` that is fitted to a stratum."""
-
-TOUCHING = "touching"
-"""Name of all states in which surfaces are in contact, wherever they were drawn. They count in their strata as well: a
-model does not know which states touch."""
 
 LOST = 0.01
 """If more than this share of the commands has no equilibrium, the growth of trusted states is limited."""
@@ -83,99 +80,6 @@ FORCES, FLOORS, POWERS = (0.0, 0.5, 1.0, 2.0), (0.1, 0.3, 1.0, 3.0), (0.5, 0.75,
 ROUNDS = 4
 POOL = 8
 """Candidate designs and commands of the adversarial search."""
-
-
-@dataclass(frozen=True)
-class Predictions:
-    """Predictions of a model for N judged states.
-
-    Attributes:
-        error: largest distance of an effector from that of FEM [m], shape (N,).
-        spread: of the ensemble [m], shape (N,).
-        uncertainty: [m], shape (N,).
-        trusted: shape (N,).
-        growth: predicted growth (see `Domain`), shape (N,); 1 for robots that do not buckle.
-        found: the model and FEM both have an equilibrium, shape (N,).
-    """
-
-    error: np.ndarray
-    spread: np.ndarray
-    uncertainty: np.ndarray
-    trusted: np.ndarray
-    growth: np.ndarray
-    found: np.ndarray
-
-
-@dataclass(frozen=True)
-class StratumReport:
-    """How a model does in one stratum.
-
-    Attributes:
-        states: number of states in which FEM and the model have an equilibrium.
-        mean: mean error of the effector [m].
-        worst: largest error [m].
-        coverage: share of the errors below their uncertainty.
-        trusted: share of the states that are trusted.
-        worst_trusted: largest error of a trusted state [m].
-        lost: commands without an equilibrium on FEM; they do not count in any of the above.
-        unsolved: those of them that are trusted.
-    """
-
-    states: int
-    mean: float
-    worst: float
-    coverage: float
-    trusted: float
-    worst_trusted: float
-    lost: int
-    unsolved: int
-
-
-def reached(model: SurrogateModel, context: Any, command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the displacements (B, n_a) that a model predicts under commands, and whether it found them (B,)."""
-    if not model.robot.learning.convex:  # its cables can push
-        return command, np.ones(len(command), dtype=bool)
-    displacement, _, found = model.search(context, command, command, model.robot.unilateral, 5e-5, 25)
-    return displacement, found
-
-
-def predict(model: SurrogateModel, states: StratifiedStates) -> Predictions:
-    """Return a model's predictions under the commands of judged states."""
-    context = model.context(states.design)
-    displacement, found = reached(model, context, states.command)
-    effector, spread = model.effector(context, displacement)
-    uncertainty, trusted = model.trust(context, displacement, spread, states.command)
-    off = (effector - states.effector).reshape(len(states), -1, 3)
-    growth = model.softening_ratio(context, displacement) if model.domain.limits_growth else np.ones(len(states))
-    error = np.linalg.norm(off, axis=2).max(axis=1)
-    return Predictions(error, spread, uncertainty, trusted & found, growth, found & states.found)
-
-
-def report(model: SurrogateModel, states: StratifiedStates) -> dict[str, StratumReport]:
-    """Return how a model does in each stratum of judged states, and in all that touch, under `TOUCHING`."""
-    return _by_stratum(predict(model, states), states)
-
-
-def _by_stratum(every: Predictions, states: StratifiedStates) -> dict[str, StratumReport]:
-    groups = {str(stratum): states.stratum == stratum for stratum in dict.fromkeys(states.stratum.tolist())}
-    if states.touching.any():
-        groups[TOUCHING] = states.touching
-    return {name: _report(every, states, which) for name, which in groups.items() if (which & every.found).any()}
-
-
-def _report(every: Predictions, states: StratifiedStates, which: np.ndarray) -> StratumReport:
-    """Return how a model does in some of the judged states."""
-    rows = which & every.found
-    return StratumReport(
-        states=int(rows.sum()),
-        mean=float(every.error[rows].mean()),
-        worst=float(every.error[rows].max()),
-        coverage=float((every.error <= every.uncertainty)[rows].mean()),
-        trusted=float(every.trusted[rows].mean()),
-        worst_trusted=float(every.error[rows & every.trusted].max(initial=0.0)),
-        lost=int((which & ~states.found).sum()),
-        unsolved=int((every.trusted & ~states.found & which).sum()),
-    )
 
 
 # -- states --------------------------------------------------------------------------------------------------------
@@ -474,7 +378,7 @@ def cross_validated(model: SurrogateModel, states: StratifiedStates, folds: int 
         order.append(np.flatnonzero(left_out))
     back = np.argsort(np.concatenate(order))
     every = Predictions(*(np.concatenate([getattr(part, f.name) for part in parts])[back] for f in fields(Predictions)))
-    return _by_stratum(every, states)
+    return by_stratum(every, states)
 
 
 def calibration_states(model: SurrogateModel, folder: str | Path) -> StratifiedStates:

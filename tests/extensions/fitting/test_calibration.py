@@ -14,15 +14,11 @@ from softgym_envs.errors import WeightsError
 from softgym_envs.extensions.fitting import calibration as module
 from softgym_envs.extensions.fitting.calibration import (
     FACTOR_OF,
-    Predictions,
     adversarial_search,
     calibrate,
     conformal_quantile,
     fit_calibration,
     judged_states,
-    predict,
-    reached,
-    report,
     safe_bounds,
     safe_limit,
     with_domain,
@@ -31,6 +27,7 @@ from softgym_envs.extensions.fitting.cli import calibrate_trust
 from softgym_envs.extensions.fitting.data import strata
 from softgym_envs.extensions.fitting.data.strata import StratifiedStates, draw_commands, strata_of
 from softgym_envs.extensions.fitting.potential import stack_members, unstack_members
+from softgym_envs.extensions.fitting.predictions import TOUCHING, Predictions, predict, reached, report
 from softgym_envs.extensions.gpu.surrogates import TorchBatch
 from softgym_envs.surrogate.domain import OUTSIDE, SOFT, SPREAD, Calibration, Domain, distrust_text
 from softgym_envs.surrogate.features import learned_variables
@@ -543,7 +540,7 @@ def test_shipped_weights_hold_what_trust_promises(variant):
     assert all(row["unsolved"] == 0 for row in rows.values())
     assert ("adversarial" in rows) == bool(model.card["calibration"]["adversarial_states"])
     rows.pop("adversarial", None)
-    rows.pop(module.TOUCHING, None)
+    rows.pop(TOUCHING, None)
     assert rows.keys() == set(strata_of(robot, buckles=model.domain.limits_growth))
     for row in rows.values():
         covered = conformal_quantile(np.arange(1.0, row["states"] + 1.0)) / row["states"]

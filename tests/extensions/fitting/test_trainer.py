@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from softgym_envs import make_robot
-from softgym_envs.extensions.fitting.calibration import reached
 from softgym_envs.extensions.fitting.data.states import States
 from softgym_envs.extensions.fitting.potential import make_targets, potential_loss, unstack_members
+from softgym_envs.extensions.fitting.predictions import reached
 from softgym_envs.extensions.fitting.trainer import Trainer
 from softgym_envs.extensions.networks import thesis
 from softgym_envs.extensions.networks.perceptron import perceptron
