@@ -17,7 +17,7 @@ from softgym_envs.mechanics.solvers.beam_frames import move
 from softgym_envs.mechanics.solvers.beam_motion import anchors_of
 from softgym_envs.mechanics.solvers.dynamics import Dynamics
 from softgym_envs.mechanics.solvers.statics import Statics
-from tests.verification.walkers import H, dynamics, ground, mover, random_walk, remaining, trot, walker
+from tests.verification.walkers import H, compared_walk, dynamics, ground, trot, walker
 
 
 def tilted(angle):
@@ -92,25 +92,12 @@ def test_steps_of_a_walk_are_those_of_the_general_solver(standing):
 @pytest.mark.parametrize("seed", [0, 4, 6, 17])
 def test_random_walks_take_whole_steps_that_solve_the_general_equations(seed):
     """Of twenty random bodies and gaits, these four pass most often between sticking and sliding."""
-    backend, commands = random_walk(seed)
-    solver, general = mover(backend), mover(backend, compiled=False)
-    touching = sliding = 0
-    for k, command in enumerate(commands):
-        start = solver.x, solver.effort, solver.velocity, solver.memory
-        taken, found = solver.advance_compiled(command[None])
-        assert taken == 1
-        assert found.substeps == 1
-        if k % 10:
-            continue
-        state = found.equilibrium
-        correction, exact = remaining(general, start, state.x, state.effort, command)
-        assert correction < solver.tolerance
-        size = np.sqrt(np.abs(np.diag(exact)))
-        assert (np.abs(state.condensed.compliance - exact) < 1e-6 * np.outer(size, size)).all()
-        touching += state.contacts.count
-        sliding += int(state.contacts.sliding.sum())
-    assert touching > 20
-    assert sliding > 5
+    found = compared_walk(seed)
+    assert (found.steps, found.divided, found.compared) == (200, 0, 20)
+    assert found.correction < 1e-9
+    assert found.compliance < 1e-6
+    assert found.touching > 20
+    assert found.sliding > 5
 
 
 def test_steps_between_other_obstacles_are_those_of_the_general_solver():

@@ -11,6 +11,7 @@ import click
 
 from tests.verification import contact, contact_control, contact_friction, dynamics, infill, side_by_side, statics
 from tests.verification.robot_dynamics import tetrapod
+from tests.verification.walkers import walkers
 
 CHECKS = {
     "statics": statics.validation,
@@ -21,6 +22,7 @@ CHECKS = {
     "infill": infill.compliances,
     "contact_control": contact_control.contact_control,
     "contact_friction": contact_friction.contact_friction,
+    "walkers": walkers,
 }
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -114,3 +115,58 @@ def remaining(general, start, x, effort, command):
         assert general.linearisation.update(x, effort, exact=True)
         step, _ = general._correction(None, general.linearisation.delta, effort, goal, np.arange(len(command)))
         return general._norm(step), general.linearisation.W.copy()
+
+
+@dataclass(frozen=True)
+class Walk:
+    """A walk of one body against the equations of the general solver, which is not asked for a walk of its own.
+
+    Args:
+        seed: of `random_walk`.
+        steps: time steps that compiled code took.
+        divided: those of them that it had to divide, which are not compared.
+        compared: states that were.
+        correction: largest motion by which the general solver would correct one of these states [m].
+        compliance: largest error of ``W``, relative to its diagonal.
+        touching: points that touched, over all these states.
+        sliding: those that slid.
+    """
+
+    seed: int
+    steps: int
+    divided: int
+    compared: int
+    correction: float
+    compliance: float
+    touching: int
+    sliding: int
+
+
+def compared_walk(seed, *, every=10):
+    """Take the steps of `random_walk` and compare the end of every few of them with the general equations."""
+    backend, commands = random_walk(seed)
+    solver, general = mover(backend), mover(backend, compiled=False)
+    steps = divided = compared = touching = sliding = 0
+    correction = error = 0.0
+    for k, command in enumerate(commands):
+        start = solver.x, solver.effort, solver.velocity, solver.memory
+        taken, found = solver.advance_compiled(command[None])
+        if not taken:
+            break
+        steps += 1
+        divided += found.substeps > 1
+        if k % every or found.substeps > 1:
+            continue
+        state = found.equilibrium
+        left, exact = remaining(general, start, state.x, state.effort, command)
+        size = np.sqrt(np.abs(np.diag(exact)))
+        error = max(error, float((np.abs(state.condensed.compliance - exact) / np.outer(size, size)).max()))
+        correction, compared = max(correction, left), compared + 1
+        touching += state.contacts.count
+        sliding += int(state.contacts.sliding.sum())
+    return Walk(seed, steps, divided, compared, correction, error, touching, sliding)
+
+
+def walkers(count=100):
+    """Compare the walks of many random bodies and gaits, 40 control steps each, with the general equations."""
+    return [asdict(compared_walk(seed)) for seed in range(count)]
