@@ -15,8 +15,8 @@ from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.contact.contact import ContactMemory
 from softgym_envs.mechanics.elements.beams import are_folded
 from softgym_envs.mechanics.solvers.beam_batch import BeamBatch, BeamStates
+from softgym_envs.mechanics.solvers.beam_contact import ContactPoints
 from softgym_envs.mechanics.solvers.beam_motion import BeamMotion, anchors_of, memory_of
-from softgym_envs.mechanics.solvers.beam_points import ContactPoints
 from softgym_envs.mechanics.solvers.equilibrium import RowLayout
 from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.domain import FOLDED

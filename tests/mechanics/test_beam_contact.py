@@ -89,9 +89,9 @@ def test_steps_of_a_walk_are_those_of_the_general_solver(standing):
     assert sliding > 5
 
 
-@pytest.mark.parametrize("seed", [0, 4, 6, 14, 17])
+@pytest.mark.parametrize("seed", [0, 4, 6, 17])
 def test_random_walks_take_whole_steps_that_solve_the_general_equations(seed):
-    """Of twenty random bodies and gaits, these pass most often between sticking and sliding; 14 does so in step 11."""
+    """Of twenty random bodies and gaits, these four pass most often between sticking and sliding."""
     found = compared_walk(seed)
     assert (found.steps, found.divided, found.compared) == (200, 0, 20)
     assert found.correction < 1e-9

@@ -72,15 +72,15 @@ def quick_gap(p, parameters, edges):
 def gap_of(p, parameters, edges, normal, curvature):
     """Return the gap [m] of a point (3,) to an obstacle; fill its normal (3,) and curvature (3, 3)."""
     kind = int(parameters[0])
+    matrix = parameters[8:17].reshape(3, 3)
     if kind == PLANE:
         gap = 0.0
         for i in range(3):
-            normal[i] = parameters[8 + i]
+            normal[i] = matrix[0, i]
             gap += normal[i] * (p[i] - parameters[5 + i])
             for j in range(3):
                 curvature[i, j] = 0.0
         return gap
-    matrix = parameters[8:17].reshape(3, 3)
     if kind == ROUND:
         x, y, z = p[0] - parameters[5], p[1] - parameters[6], p[2] - parameters[7]
         square = 0.0

@@ -21,10 +21,10 @@ from softgym_envs.mechanics.solvers.beam_body import (
     Rows,
     Servos,
 )
+from softgym_envs.mechanics.solvers.beam_contact import ContactPoints
 from softgym_envs.mechanics.solvers.beam_equations import Equations
 from softgym_envs.mechanics.solvers.beam_motion import BeamState, Stepping, march
 from softgym_envs.mechanics.solvers.beam_newton import Factor, System, make_system
-from softgym_envs.mechanics.solvers.beam_points import ContactPoints
 from softgym_envs.mechanics.solvers.block_cholesky import SIZE, BlockPattern
 
 
@@ -203,7 +203,6 @@ def _points(c, k):
     """Return the points of body ``k``."""
     return ContactPoints(
         c.groups[k],
-        c.rows[k],
         c.frames[k],
         c.blocks[k],
         c.place[k],

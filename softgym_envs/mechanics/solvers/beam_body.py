@@ -15,7 +15,7 @@ from softgym_envs.mechanics.elements.beams import Beam
 from softgym_envs.mechanics.elements.rigid import RigidBody
 from softgym_envs.mechanics.frames import Frames
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.solvers.beam_points import ContactPoints, contact_points, reason_against
+from softgym_envs.mechanics.solvers.beam_contact import ContactPoints, contact_points, reason_against
 from softgym_envs.mechanics.solvers.block_cholesky import SIZE, BlockPattern, analyse
 
 MAX_ACTUATORS = 16

@@ -22,7 +22,7 @@ from softgym_envs.mechanics.elements.beam_kernels import (
     strains,
 )
 from softgym_envs.mechanics.solvers.beam_body import DIRECTOR, FIXED, ORIGIN, BeamBody
-from softgym_envs.mechanics.solvers.beam_contact import Slides, add_contact, forget_near, hold_slides, make_slides
+from softgym_envs.mechanics.solvers.beam_contact import Slides, add_contact, hold_slides, make_slides
 from softgym_envs.mechanics.solvers.beam_frames import add_curvature, reduce_forces
 from softgym_envs.mechanics.solvers.block_cholesky import SIZE
 
@@ -86,7 +86,7 @@ def make_equations(body: BeamBody, size: int) -> Equations:
         delta=np.zeros(size),
         H=np.zeros((size, count, SIZE)),
         energy=np.zeros(1),
-        slides=make_slides(body.contact, count, size, n),
+        slides=make_slides(body.contact, count, size),
     )
 
 
@@ -434,7 +434,7 @@ def add_constraints(body, x, effort, equations, full):
                     column[3 + k] -= weight * slope[j]
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy")
 def _add_chambers(chambers, rows, x, effort, equations, full):
     """Do for chambers what `add_constraints` does for the others."""
     gradient, H, delta, tangent = equations.gradient, equations.H, equations.delta, equations.tangent
@@ -443,24 +443,20 @@ def _add_chambers(chambers, rows, x, effort, equations, full):
         delta[chambers.number[c]] = -chambers.rest[c]
     for q in range(chambers.chamber.shape[0]):
         c, area, frames, weights = chambers.chamber[q], chambers.area[q], chambers.frames[q], chambers.weights[q]
-        u, v, w = 0.0, 0.0, 0.0
+        t[:] = 0.0
         for a in range(3):
             for k in range(4):
-                row, share = frames[a] + k, weights[a, k]
-                u += share * x[row, 0]
-                v += share * x[row, 1]
-                w += share * x[row, 2]
-        norm = np.sqrt(u * u + v * v + w * w)
+                for d in range(3):
+                    t[d] += weights[a, k] * x[frames[a] + k, d]
+        norm = np.sqrt(t[0] * t[0] + t[1] * t[1] + t[2] * t[2])
         delta[c] += area * norm
-        t[0], t[1], t[2] = u / norm, v / norm, w / norm
+        for d in range(3):
+            t[d] /= norm
         pull = effort[c] * area
-        u, v, w = pull * t[0], pull * t[1], pull * t[2]
         for a in range(3):
             for k in range(4):
-                row, share = frames[a] + k, weights[a, k]
-                gradient[row, 0] -= share * u
-                gradient[row, 1] -= share * v
-                gradient[row, 2] -= share * w
+                for d in range(3):
+                    gradient[frames[a] + k, d] -= pull * weights[a, k] * t[d]
         if not full:
             continue
         # The motion of the tangent: frame a, or the one on which it is mounted, moves it by weights[a, 0] u + w x p.
@@ -528,17 +524,12 @@ def _hold(pattern, components, equations):
 @njit(cache=True, error_model="numpy")
 def assemble(body, x, effort, step, equations, full):
     """Fill the equations at rows ``x`` (n, 3) and efforts (size,); tangent and ``H`` only if ``full``."""
-    forget_near(equations.slides)
-    assemble_parts(body, x, effort, step, equations, full, full, full)
+    assemble_parts(body, x, effort, step, equations, full, full)
 
 
 @njit(cache=True, error_model="numpy")
-def assemble_parts(body, x, effort, step, equations, full, touching, pressing):
-    """Fill the equations as `assemble`, the stiffness of contact only if ``touching``.
-
-    The forces of contact turn with the frames; the tangent has that only if ``pressing``, without which pressed bodies
-    may be unstable if they lack the stiffness of what presses on them.
-    """
+def assemble_parts(body, x, effort, step, equations, full, touching):
+    """Fill the equations as `assemble`, the stiffness of contact only if ``touching``."""
     gradient = equations.gradient
     for row in range(x.shape[0]):
         for d in range(3):
@@ -549,7 +540,7 @@ def assemble_parts(body, x, effort, step, equations, full, touching, pressing):
     _add_drag(body.elements, x, step, equations, full)
     _add_inertia(body.masses, x, step, equations, full)
     add_constraints(body, x, effort, equations, full)
-    if full and not pressing:
+    if full and not touching:  # pressed bodies may be unstable without the stiffness of what presses on them
         add_curvature(body.frames, x, gradient, equations.tangent)
     add_contact(body.contact, equations.slides, x, step.anchors, equations, touching)
     reduce_forces(body.frames, x, gradient, equations.residual)
@@ -558,7 +549,7 @@ def assemble_parts(body, x, effort, step, equations, full, touching, pressing):
         for i in range(6):
             residual[k, i] *= free[k, i]
     if full:
-        if pressing:
+        if touching:
             add_curvature(body.frames, x, gradient, equations.tangent)
         _hold(body.pattern, body.components, equations)
         hold_slides(equations.slides, free)

@@ -19,9 +19,9 @@ from numba.extending import overload
 from softgym_envs.mechanics.compilation import njit
 from softgym_envs.mechanics.solvers.beam_body import beam_body
 from softgym_envs.mechanics.solvers.beam_contact import (
+    ContactPoints,
     Slides,
     commit,
-    forget_near,
     free_part,
     has_failed,
     touching,
@@ -44,7 +44,6 @@ from softgym_envs.mechanics.solvers.beam_newton import (
     make_system,
     solve,
 )
-from softgym_envs.mechanics.solvers.beam_points import ContactPoints
 from softgym_envs.mechanics.solvers.beam_touching import solve_touching
 from softgym_envs.mechanics.solvers.block_cholesky import SIZE
 from softgym_envs.mechanics.solvers.equilibrium import SATURATED
@@ -306,7 +305,6 @@ def march_rows(system, strains, state, targets, drive, limit, stepping, finish, 
     kept, effort = copy_state(state), state.effort
     first, goal = np.empty(effort.shape[0]), np.empty(effort.shape[0])
     orthonormalise(system.body.frames, state.x)
-    forget_near(system.equations.slides)
     without = not stepping.h > 0.0  # no literal, for which everything would be compiled again
     add_constraints(system.body, state.x, effort, system.equations, without)
     state.delta[:] = system.equations.delta

@@ -1,7 +1,8 @@
 """Newton's method for bodies of beams, compiled: equations are linearised, factorised and solved for one time step.
 
 `solve` takes whole steps and keeps its factor while it converges fast. `approach` shortens steps and divides the way to
-the target into increments, as `Statics` does. `beam_touching` solves for bodies that may touch something.
+the target into increments, as `Statics` does. `solve_in_contact` takes steps as far as no point enters an obstacle;
+`beam_touching` goes on where it fails.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import numpy as np
 
 from softgym_envs.mechanics.compilation import FAST, njit
 from softgym_envs.mechanics.solvers.beam_body import BeamBody
-from softgym_envs.mechanics.solvers.beam_contact import has_failed, slide
+from softgym_envs.mechanics.solvers.beam_contact import free_part, has_failed, slide
 from softgym_envs.mechanics.solvers.beam_equations import (
     Equations,
     assemble,
@@ -36,6 +37,11 @@ LONG, LONG_IN_TIME, TOO_LONG = 0.01, 0.002, 1.0
 REMAINING, SMALLEST = 0.01, 1e-13
 """A solution is found when the next step will be shorter than this part of the tolerance, or than this length [m],
 which is near rounding. Errors of a time step act on the next one through the velocities."""
+MAX_CONTACT, WHOLE, LONGEST = 30, 1, 0.3
+"""With contact: the largest number of Newton iterations; that of whole ones, before the forces along steps are looked
+at; the longest step, as the largest turn of a frame [rad]."""
+MAX_TRIALS, BALANCED = 12, 0.3
+"""The largest number of parts of a step that are tried, and the part of the forces along it that may be left."""
 
 
 class Factor(NamedTuple):
@@ -385,3 +391,96 @@ def approach(system, x, effort, target, drive, step, tolerance):
         done = level
         size *= 1.5
     return iterations
+
+
+@njit(cache=True, error_model="numpy")
+def take(system, kept, x, stride, part):
+    """Move rows ``x`` by a part of a step from those ``kept``."""
+    factor, x[:] = system.factor, kept
+    for k in range(stride.shape[0]):
+        for i in range(SIZE):
+            factor.step[k, i] = part * stride[k, i]
+    move(system.body.frames, x, factor.step, factor.turned)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _part_of_step(system, kept, x, stride, effort, step, most, start):
+    """Return the part of a step, up to ``most``, at which the forces along it vanish; rows ``x`` are moved by it.
+
+    ``start`` < 0 are the forces along the step at its start with the efforts (size,) at its end. Where a point passes
+    from sliding one way over sticking to sliding the other way, they change nearly at once, and whole steps would go
+    to and fro for ever.
+    """
+    body, equations, _ = system
+    ones = np.ones_like(stride)
+    low, high, part, below, above = 0.0, most, most, start, np.inf
+    for trial in range(MAX_TRIALS):
+        take(system, kept, x, stride, part)
+        assemble(body, x, effort, step, equations, not step.h > 0.0)
+        along = np.inf if has_failed(equations.slides) else _dot(equations.residual, stride, ones)
+        if abs(along) <= BALANCED * abs(start) or (trial == 0 and along < 0.0):
+            break
+        if along > 0.0:
+            high, above, below = part, along, (0.5 * below if above < np.inf else below)
+        else:
+            low, below, above = part, along, 0.5 * above
+        part = 0.5 * (low + high) if above == np.inf else (low * above - high * below) / (above - below)
+    return part
+
+
+@njit(cache=True, error_model="numpy")
+def solve_in_contact(system, x, effort, target, drive, step, tolerance, fresh):
+    """Solve the equations of a time step in place as `solve` does, where points may touch; the iterations, or -1.
+
+    Rows ``x`` must lie outside the obstacles. Steps end where points would enter an obstacle and, if they do not soon
+    converge, where the forces along them vanish.
+    """
+    body, equations, factor = system
+    rows = np.concatenate((drive.driven, drive.forced))
+    radian, ones = body.components.scale[:, 3:].max(), np.ones_like(factor.step)
+    before, taken = np.inf, 0
+    enough = min(tolerance, max(REMAINING * tolerance, SMALLEST))
+    stride, kept = factor.step.copy(), x.copy()
+    for iteration in range(1, MAX_CONTACT + 1):
+        if fresh:
+            if _linearise(system, x, effort, step, drive, rows, False) < 0:
+                return -1
+            taken = 0
+        else:
+            number = equations.slides.number[0]  # that of the factor, which stays as it is
+            assemble(body, x, effort, step, equations, not step.h > 0.0)
+            if has_failed(equations.slides):
+                return -1
+            equations.slides.number[0] = number
+        length = correct(system, effort, target, drive)
+        if not length < np.inf:  # also true for NaN
+            return -1
+        ratio = length / before if before < np.inf else 1.0
+        if not fresh and (ratio > SLOW if iteration > 1 else length > LONG_IN_TIME * radian):
+            fresh = True  # this step is not taken
+            continue
+        start = 0.0
+        if fresh and iteration > WHOLE and length > LONG_IN_TIME * radian:
+            start = _dot(equations.residual, factor.step, ones)
+            for c in range(effort.shape[0]):
+                start -= factor.efforts[c] * _dot(equations.H[c], factor.step, ones)
+        for c in range(effort.shape[0]):
+            effort[c] += factor.efforts[c]
+        stride[:] = factor.step
+        kept[:] = x
+        part, free = min(1.0, LONGEST * radian / length), 0.0
+        while free < 1.0:
+            take(system, kept, x, stride, part)
+            free = free_part(body.contact, equations.slides, kept, x)
+            part *= free  # the way bends, so it is tested again
+            if part < SHORTEST:
+                return -1
+        if start < 0.0:
+            part = _part_of_step(system, kept, x, stride, effort, step, part, start)
+        taken += 1
+        # After a step with a new factor the next one shrinks by the square of the ratio.
+        if part == 1.0 and (length <= enough or length * ratio * (1.0 if taken == 1 else 2.0) <= enough):
+            return iteration
+        fresh = part < 1.0 or length > LONG_IN_TIME * radian
+        before = length if part == 1.0 else np.inf
+    return -1

@@ -1,4 +1,4 @@
-"""Time steps of bodies of beams that may touch obstacles, compiled.
+"""Time steps of bodies of beams that touch obstacles, where Newton's method for the whole body fails, compiled.
 
 The stiffness of contact changes within a step as points land, stick and slide; that of everything else hardly does. So
 the tangent is factorised without contact, and the forces of contact are found exactly for the linearised body: with the
@@ -19,22 +19,22 @@ from softgym_envs.mechanics.contact.compiled import add_friction, quick_gap, tou
 from softgym_envs.mechanics.solvers.beam_contact import (
     add_wrench,
     fill_arms,
-    find_near,
     free_part,
     has_failed,
     point_at,
+    spread_of,
 )
 from softgym_envs.mechanics.solvers.beam_equations import assemble_parts
-from softgym_envs.mechanics.solvers.beam_frames import move
 from softgym_envs.mechanics.solvers.beam_newton import (
-    LONG_IN_TIME,
+    LONGEST,
     REMAINING,
     SHORTEST,
     SMALLEST,
-    STEEP,
     correct,
     factorise_tangent,
     invert_driven,
+    solve_in_contact,
+    take,
 )
 from softgym_envs.mechanics.solvers.block_cholesky import SIZE, solve_lower, solve_upper
 
@@ -42,9 +42,8 @@ MAX_ITERATIONS = 30
 """Largest number of steps of the whole body."""
 MAX_LOCAL, MAX_HELD = 40, 40
 """Largest numbers of Newton steps of the forces of contact, and of limits of friction that are held in turn."""
-LONGEST, SLOW = 0.3, 0.2
-"""Longest step, as the largest turn of a frame [rad]; length of a step over that of the last one, above which the
-factor is renewed after it, and above `STEEP` in its place."""
+SLOW = 0.25
+"""Length of a step over that of the last one, above which the factor is renewed in place of the step."""
 EXACT = 0.1
 """Error of the forces of contact, as motions of their points, over that of a step."""
 
@@ -128,45 +127,16 @@ def _open(local):
     return largest, abs(work)
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
-def _eliminate(matrix, right):
-    """Solve a dense system in place: ``right`` (n,) becomes the solution; whether there is one."""
-    n = right.shape[0]
-    for k in range(n):
-        best = k
-        for i in range(k + 1, n):
-            if abs(matrix[i, k]) > abs(matrix[best, k]):
-                best = i
-        if not 0.0 < abs(matrix[best, k]) < np.inf:
-            return False
-        if best != k:
-            for j in range(k, n):
-                matrix[k, j], matrix[best, j] = matrix[best, j], matrix[k, j]
-            right[k], right[best] = right[best], right[k]
-        for i in range(k + 1, n):
-            part = matrix[i, k] / matrix[k, k]
-            if part != 0.0:
-                for j in range(k + 1, n):
-                    matrix[i, j] -= part * matrix[k, j]
-                right[i] -= part * right[k]
-    for k in range(n - 1, -1, -1):
-        value = right[k]
-        for j in range(k + 1, n):
-            value -= matrix[k, j] * right[j]
-        right[k] = value / matrix[k, k]
-    return True
-
-
 @njit(cache=True, error_model="numpy")
-def _descend(contact, anchors, local, touch, exact, held, energy):
+def _descend(contact, anchors, local, touch, exact, held):
     """Take Newton steps of the forces of contact until they move points by less than ``exact``; whether they do.
 
-    The pulls of the present forces are known, and ``energy`` is theirs.
     They are shortened until they reduce the energy if limits are ``held``, and otherwise the work of the residual.
     """
     count = local.number[0]
     size = 3 * count
     step, kept, active = np.zeros(size), np.empty(size), np.empty(size, dtype=np.int64)
+    energy = _pulls(contact, anchors, local, touch, held)
     if energy == np.inf:
         return False
     for _ in range(MAX_LOCAL):
@@ -194,10 +164,9 @@ def _descend(contact, anchors, local, touch, exact, held, energy):
                 for e in range(3):
                     value += local.tangent[i, d, e] * local.compliance[3 * i + e, active[b]]
                 matrix[a, b] = value
-        if not _eliminate(matrix, right):
-            return False
+        found = np.linalg.solve(matrix, right)
         for a in range(number):
-            step[active[a]] = right[a]
+            step[active[a]] = found[a]
         slope = 0.0
         for i in range(size):
             kept[i] = local.force[i]
@@ -235,13 +204,12 @@ def _spring(local):
 
 @njit(cache=True, error_model="numpy")
 def _find_forces(contact, anchors, local, touch, exact):
-    """Solve for the forces of contact on the linearised body; 1 if they are found, 0 if nearly, -1 if not."""
+    """Solve for the forces of contact on the linearised body; whether they are found."""
     size = 3 * local.number[0]
     force, start = local.force, local.start
     held, follow = exact > 0.0, not exact > 0.0  # no literals, for each of which everything would be compiled again
     force[:size] = start[:size]
-    energy = _pulls(contact, anchors, local, touch, follow)
-    if energy == np.inf:
+    if _pulls(contact, anchors, local, touch, follow) == np.inf:
         # Forces that hold all points in place, where they are outside.
         trace = 0.0
         for i in range(size):
@@ -249,50 +217,34 @@ def _find_forces(contact, anchors, local, touch, exact):
         matrix = local.compliance[:size, :size].copy()
         for i in range(size):
             matrix[i, i] += 1e-9 * trace / size
-        right = local.free[:size].copy()
-        if not _eliminate(matrix, right):
-            return -1
-        force[:size] -= right
-        energy = _pulls(contact, anchors, local, touch, follow)
-        if energy == np.inf:
-            return -1
+        force[:size] -= np.linalg.solve(matrix, local.free[:size])
+        if _pulls(contact, anchors, local, touch, follow) == np.inf:
+            return False
     first, limit, before = force[:size].copy(), local.limit.copy(), np.inf
-    if _descend(contact, anchors, local, touch, exact, follow, energy):
-        return 1
+    if _descend(contact, anchors, local, touch, exact, follow):
+        return True
     force[:size] = first
     local.limit[:] = limit
     share = 1.0
     for turn in range(MAX_HELD):
         limit[:] = local.limit
-        energy = _pulls(contact, anchors, local, touch, held)
-        _descend(contact, anchors, local, touch, exact, held, energy)
+        _descend(contact, anchors, local, touch, exact, held)
         first[:] = force[:size]
         change = 0.0
-        energy = _pulls(contact, anchors, local, touch, follow)  # fills the limits that follow
-        if energy == np.inf:
-            return -1
+        if _pulls(contact, anchors, local, touch, follow) == np.inf:  # fills the limits that follow
+            return False
         for i in range(local.number[0]):
             for o in range(limit.shape[1]):
                 change = max(change, abs(local.limit[i, o] - limit[i, o]))
                 limit[i, o] += share * (local.limit[i, o] - limit[i, o])
-        if turn % 3 == 2 and _descend(contact, anchors, local, touch, exact, follow, energy):
-            return 1
+        if turn % 3 == 2 and _descend(contact, anchors, local, touch, exact, follow):
+            return True
         force[:size] = first
         local.limit[:] = limit
         if change > 0.8 * before:
             share = max(0.5 * share, 0.1)
         before = change
-    return 0
-
-
-@njit(cache=True, error_model="numpy")
-def _take(system, kept, x, stride, part):
-    """Move rows ``x`` by a part of a step from those ``kept``."""
-    factor, x[:] = system.factor, kept
-    for k in range(stride.shape[0]):
-        for i in range(SIZE):
-            factor.step[k, i] = part * stride[k, i]
-    move(system.body.frames, x, factor.step, factor.turned)
+    return False
 
 
 @njit(cache=True, error_model="numpy")
@@ -301,48 +253,44 @@ def _choose(contact, slides, x, moved, renewed):
 
     Those of the last choice stay, unless ``renewed``.
     """
-    local, near, p, distance = slides.local, slides.near, slides.p, contact.law[0]
+    local, p, distance = slides.local, slides.p, contact.law[0]
     count = 0 if renewed else local.number[0]
     kept = count
-    find_near(contact, slides, x, moved)
-    for n in range(near.number[0]):
-        k, g, o = near.point[n], near.group[n], near.obstacle[n]
-        obstacle, edges = contact.obstacles[o], contact.edges[o]
-        point_at(contact, g, k, x, p)
-        if not quick_gap(p, obstacle, edges) < distance:
-            point_at(contact, g, k, moved, p)
-            if not quick_gap(p, obstacle, edges) < distance:
+    for g in range(contact.frames.shape[0]):
+        row = contact.frames[g, 0]
+        now, then = distance + spread_of(contact, g, x), distance + spread_of(contact, g, moved)
+        for o in range(contact.obstacles.shape[0]):
+            obstacle, edges = contact.obstacles[o], contact.edges[o]
+            here = quick_gap(x[row], obstacle, edges) < now
+            there = quick_gap(moved[row], obstacle, edges) < then
+            if not (here or there):
                 continue
-        i = 0
-        while i < count and local.points[i] != k:
-            i += 1
-        if i < count:
-            continue
-        if count == local.points.shape[0]:
-            return -1
-        first = contact.blocks[g].max()
-        for f in range(contact.blocks.shape[1]):
-            if contact.blocks[g, f] >= 0:
-                first = min(first, contact.blocks[g, f])
-        local.points[count], local.group[count], local.first[count] = k, g, first
-        count += 1
+            for k in range(contact.groups[g], contact.groups[g + 1]):
+                near = False
+                if here:
+                    point_at(contact, g, k, x, p)
+                    near = quick_gap(p, obstacle, edges) < distance
+                if there and not near:
+                    point_at(contact, g, k, moved, p)
+                    near = quick_gap(p, obstacle, edges) < distance
+                for i in range(count):
+                    near = near and local.points[i] != k
+                if near:
+                    if count == local.points.shape[0]:
+                        return -1
+                    local.points[count], local.group[count] = k, g
+                    count += 1
     local.number[0] = count
     return 1 if renewed or count > kept else 0
 
 
 @njit(cache=True, error_model="numpy", fastmath=FAST)
-def _dot_from(a, b, signs, k, pattern):
-    """Return the sum of the products of two vectors (b, 6) with signs, of which one begins at block ``k``.
-
-    It is a solution ``L^-1 f`` for a force on that block, and so zero except where the elimination of ``k`` leads.
-    """
+def _dots(a, b, signs):
+    """Return the sum of the products of two vectors with signs, all flat."""
     value = 0.0
-    while True:
-        for i in range(SIZE):
-            value += signs[k, i] * a[k, i] * b[k, i]
-        if pattern.pointers[k] == pattern.pointers[k + 1]:
-            return value
-        k = pattern.columns[pattern.pointers[k]]
+    for i in range(a.shape[0]):
+        value += signs[i] * a[i] * b[i]
+    return value
 
 
 @njit(cache=True, error_model="numpy")
@@ -350,7 +298,8 @@ def _soften(system, x, effort, drive):
     """Fill the compliance of the chosen points, with the values of driven rows held unless they are slack."""
     body, equations, factor = system
     contact, local, driven = body.contact, equations.slides.local, drive.driven
-    size, arms, signs = 3 * local.number[0], equations.slides.arms, factor.signs
+    size, length = 3 * local.number[0], factor.step.size
+    arms, signs = equations.slides.arms, factor.signs.reshape(length)
     for i in range(local.number[0]):
         k, g = local.points[i], local.group[i]
         fill_arms(contact, g, k, x, arms)
@@ -365,9 +314,9 @@ def _soften(system, x, effort, drive):
                         half[b, e] *= body.components.free[b, e]
             solve_lower(equations.tangent, body.pattern.pointers, body.pattern.columns, half)
     for i in range(size):
+        half = local.half[i].reshape(length)
         for j in range(i + 1):
-            first = max(local.first[i // 3], local.first[j // 3])
-            value = _dot_from(local.half[i], local.half[j], signs, first, body.pattern)
+            value = _dots(half, local.half[j].reshape(length), signs)
             local.compliance[i, j] = value
             local.compliance[j, i] = value
     count = driven.shape[0]
@@ -381,19 +330,19 @@ def _soften(system, x, effort, drive):
             among[j, j] = 1.0
             continue
         for i in range(size):
-            coupling[j, i] = _dot_from(local.half[i], factor.half[driven[j]], signs, local.first[i // 3], body.pattern)
+            coupling[j, i] = _dots(local.half[i].reshape(length), factor.half[driven[j]].reshape(length), signs)
     local.relief[:count, :size] = np.linalg.solve(among, coupling)
     for i in range(size):
-        for j in range(count):
-            pull = coupling[j, i]
-            if pull != 0.0:
-                for n in range(size):
-                    local.compliance[i, n] -= pull * local.relief[j, n]
+        for n in range(size):
+            value = 0.0
+            for j in range(count):
+                value += coupling[j, i] * local.relief[j, n]
+            local.compliance[i, n] -= value
 
 
 @njit(cache=True, error_model="numpy")
 def _press(system, x, step, drive, exact):
-    """Add to a step of the body what the forces of contact change on it; what `_find_forces` returns."""
+    """Add to a step of the body what the forces of contact change on it; whether they are found."""
     body, equations, factor = system
     contact, slides, local = body.contact, equations.slides, equations.slides.local
     count, size = local.number[0], 3 * local.number[0]
@@ -406,7 +355,7 @@ def _press(system, x, step, drive, exact):
             local.force[3 * i + d] = 0.0
             local.start[3 * i + d] = 0.0
     if _pulls(contact, step.anchors, local, slides.touch, not exact > 0.0) == np.inf:
-        return -1
+        return False
     for i in range(count):
         k, g = local.points[i], local.group[i]
         fill_arms(contact, g, k, x, slides.arms)
@@ -420,9 +369,8 @@ def _press(system, x, step, drive, exact):
             for d in range(3):
                 e, c = (d + 1) % 3, (d + 2) % 3
                 local.free[3 * i + d] += share * motion[d] + motion[3 + e] * arm[c] - motion[3 + c] * arm[e]
-    found = _find_forces(contact, step.anchors, local, slides.touch, exact)
-    if found < 0:
-        return found
+    if not _find_forces(contact, step.anchors, local, slides.touch, exact):
+        return False
     change = np.zeros_like(factor.step)
     flat, signs = change.reshape(change.size), factor.signs.reshape(change.size)
     for i in range(size):
@@ -442,11 +390,11 @@ def _press(system, x, step, drive, exact):
     for b in range(change.shape[0]):
         for i in range(SIZE):
             factor.step[b, i] += change[b, i]
-    return found
+    return True
 
 
 @njit(cache=True, error_model="numpy")
-def solve_touching(system, x, effort, target, drive, step, tolerance, fresh):
+def _solve_by_forces(system, x, effort, target, drive, step, tolerance, fresh):
     """Solve the equations of a time step in place as `beam_newton.solve`, where points may touch; the iterations or -1.
 
     Rows ``x`` must lie outside the obstacles. Steps end where points would enter an obstacle.
@@ -456,20 +404,16 @@ def solve_touching(system, x, effort, target, drive, step, tolerance, fresh):
     rows, one_way = np.concatenate((drive.driven, drive.forced)), drive.one_way.any()
     scale, free = body.components.scale, 1.0
     radian = scale[:, 3:].max()
-    long = LONG_IN_TIME * radian
-    before, taken, renewed = np.inf, 0, True
+    before, taken = np.inf, 0
     enough = min(tolerance, max(REMAINING * tolerance, SMALLEST))
     stride, kept, moved = factor.step.copy(), x.copy(), x.copy()
-    without = not tolerance > 0.0  # no literal, for which everything would be compiled again
+    without = not tolerance > 0.0  # no literal, see above
     for iteration in range(1, MAX_ITERATIONS + 1):
-        assemble_parts(body, x, effort, step, equations, fresh, without, not without)
+        assemble_parts(body, x, effort, step, equations, fresh, without)
         if has_failed(slides):
             return -1
         if fresh:
-            negative, taken, renewed = factorise_tangent(system, rows), 0, True
-            if negative:
-                assemble_parts(body, x, effort, step, equations, fresh, without, without)
-                negative = factorise_tangent(system, rows)
+            negative, taken = factorise_tangent(system, rows), 0
             if negative < 0 or (negative and one_way):
                 return -1
             if not one_way:
@@ -479,19 +423,15 @@ def solve_touching(system, x, effort, target, drive, step, tolerance, fresh):
             return -1
         # Without the stiffness of contact, a body may be nearly unstable and its step far too long.
         stride[:] = factor.step
-        _take(system, x, moved, stride, min(1.0, LONGEST * radian / max(length, 1e-300)))
+        take(system, x, moved, stride, min(1.0, LONGEST * radian / max(length, 1e-300)))
         factor.step[:] = stride
-        others = _choose(contact, slides, x, moved, renewed)
-        renewed = False
+        others = _choose(contact, slides, x, moved, fresh)
         if others < 0:
             return -1
-        found = 1
         if slides.local.number[0]:
             if others or one_way:
                 _soften(system, x, effort, drive)
-            # Far from the solution, the linearised body may have no consistent state: what is nearly one leads on.
-            found = _press(system, x, step, drive, max(EXACT * enough, 1e-13))
-            if found < 0:
+            if not _press(system, x, step, drive, max(EXACT * enough, 1e-13)):
                 return -1
             length = 0.0
             for b in range(scale.shape[0]):
@@ -500,7 +440,7 @@ def solve_touching(system, x, effort, target, drive, step, tolerance, fresh):
             if not length < np.inf:
                 return -1
         ratio = length / before if before < np.inf else 1.0
-        if not fresh and before < np.inf and ratio > STEEP and length > enough:
+        if not fresh and ratio > SLOW and length > enough:
             fresh = True  # this step is not taken
             continue
         for c in range(effort.shape[0]):
@@ -509,14 +449,29 @@ def solve_touching(system, x, effort, target, drive, step, tolerance, fresh):
         kept[:] = x
         part, free = min(1.0, LONGEST * radian / max(length, 1e-300)), 0.0
         while free < 1.0:
-            _take(system, kept, x, stride, part)
+            take(system, kept, x, stride, part)
             free = free_part(contact, slides, kept, x)
             part *= free  # the way bends, so it is tested again
             if part < SHORTEST:
                 return -1
         taken += 1
-        if part == 1.0 and found > 0 and (length <= enough or (taken > 1 and 2.0 * length * ratio <= enough)):
+        if part == 1.0 and (length <= enough or (taken > 1 and 2.0 * length * ratio <= enough)):
             return iteration
-        fresh = part < 1.0 or length > long or (before < np.inf and ratio > SLOW)
-        before = length if part == 1.0 and found > 0 else np.inf
+        fresh = part < 1.0
+        before = length if part == 1.0 else np.inf
     return -1
+
+
+@njit(cache=True, error_model="numpy")
+def solve_touching(system, x, effort, target, drive, step, tolerance, fresh):
+    """Solve the equations of a time step in place: by `solve_in_contact`, which is faster, or else by the forces.
+
+    Returns the iterations of the method that succeeds, or -1.
+    """
+    predicted, kept = x.copy(), effort.copy()
+    iterations = solve_in_contact(system, x, effort, target, drive, step, tolerance, fresh)
+    if iterations < 0:
+        x[:] = predicted
+        effort[:] = kept
+        iterations = _solve_by_forces(system, x, effort, target, drive, step, tolerance, iterations < 0)
+    return iterations
