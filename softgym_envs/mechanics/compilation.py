@@ -75,7 +75,25 @@ def _stamp_with_sources() -> None:
     locator.get_source_stamp = get_source_stamp
 
 
+def _forget_what_is_gone() -> None:
+    """Let Numba compile again where a cache names a module or type that no longer exists, as after an upgrade.
+
+    An index is unpickled, with the types of arguments, before its stamp is compared.
+    """
+    index: Any = caching.IndexDataCacheFile
+    own_index = index._load_index
+
+    def _load_index(self: Any) -> Any:
+        try:
+            return own_index(self)
+        except (ImportError, AttributeError):
+            return {}
+
+    index._load_index = _load_index
+
+
 _stamp_with_sources()
+_forget_what_is_gone()
 
 
 def _choose_cache() -> None:

@@ -32,6 +32,23 @@ def twice():
 print(twice(), *(sum(counts.values()) for counts in twice.stats[1:]))
 """
 
+PLACE = """
+from typing import NamedTuple
+
+class Place(NamedTuple):
+    x: float
+"""
+USER = """
+from tiny.mechanics.compilation import njit
+from tiny.{module} import Place
+
+@njit(cache=True)
+def twice(place):
+    return 2.0 * place.x
+
+print(twice(Place(1.0)), *(sum(counts.values()) for counts in twice.stats[1:]))
+"""
+
 
 @pytest.fixture
 def edited(monkeypatch):
@@ -45,6 +62,20 @@ def edited(monkeypatch):
     yield edit
     monkeypatch.undo()
     compilation.source_hash.cache_clear()
+
+
+def tiny_package(folder):
+    """Make a small package with a copy of the module."""
+    package = folder / "tiny"
+    (package / "mechanics").mkdir(parents=True)
+    shutil.copy(compilation.__file__, package / "mechanics" / "compilation.py")
+    return package
+
+
+def printed(module, folder):
+    """Return the words that a module of the small package prints."""
+    command = [sys.executable, "-c", f"import tiny.{module}"]
+    return subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True).stdout.split()
 
 
 @pytest.mark.parametrize(
@@ -66,20 +97,32 @@ def test_kernels_depend_on_the_files_that_their_code_comes_from(edited, file, de
 
 
 def test_an_edit_of_a_kernel_recompiles_kernels_of_other_files_that_call_it(tmp_path):
-    """In a small package with a copy of the module; numba alone would go on with the old code."""
-    package = tmp_path / "tiny"
-    (package / "mechanics").mkdir(parents=True)
-    shutil.copy(compilation.__file__, package / "mechanics" / "compilation.py")
+    """Numba alone would go on with the old code."""
+    package = tiny_package(tmp_path)
     (package / "caller.py").write_text(CALLER)
 
     def run(length):
         (package / "kernel.py").write_text(KERNEL.format(length=length))
-        command = [sys.executable, "-c", "import tiny.caller"]
-        return subprocess.run(command, cwd=tmp_path, check=True, capture_output=True, text=True).stdout.split()
+        return printed("caller", tmp_path)
 
     assert run(1) == ["2", "0", "1"]  # result, loaded from the cache, compiled
     assert run(1) == ["2", "1", "0"]
     assert run(3) == ["6", "0", "1"]
+
+
+def test_kernels_whose_types_have_moved_are_compiled_again(tmp_path):
+    """As after an upgrade. Numba alone would not find the old module."""
+    package = tiny_package(tmp_path)
+
+    def run(module):
+        (package / f"{module}.py").write_text(PLACE)
+        (package / "user.py").write_text(USER.format(module=module))
+        return printed("user", tmp_path)
+
+    assert run("old") == ["2.0", "0", "1"]
+    (package / "old.py").unlink()
+    assert run("new") == ["2.0", "0", "1"]
+    assert run("new") == ["2.0", "1", "0"]
 
 
 def test_all_kernels_use_this_cache():
