@@ -96,6 +96,8 @@ def evaluate(
     config, others = given["config"], {**given, "config": None, "id": environment}
     if config is not None and not any(others.values()):
         wanted = load_config(config, TrainConfig, overrides).environment
+    elif overrides and "=" not in overrides[0]:
+        raise ConfigError(f"'{overrides[0]}' has no name; allowed: --environment ID, --config NAME, or KEY=VALUE")
     elif overrides:
         raise ConfigError(f"'{overrides[0]}' changes a configuration: it needs --config, and no other environment")
     else:

@@ -494,5 +494,5 @@ def test_a_card_counts_the_time_of_the_processes_of_its_environments(tmp_path):
     own, children, all_ = time.process_time(), of_children(), cpu_seconds()
     card = read_json(train(config, tmp_path / "run", progress=False).with_suffix(".json"))
     own, children, all_ = time.process_time() - own, of_children() - children, cpu_seconds() - all_
-    assert 0.0 < 0.5 * children < all_ - own < children  # what they spend on ending is not known
+    assert 0.0 < all_ - own < children  # what they spend on ending is not known
     assert own < card["cpu_seconds"] < all_
