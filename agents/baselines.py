@@ -26,7 +26,7 @@ PI_GAINS = (0.1, 0.3)
 alone leaves 0.7^k of an error after k steps. The gains of the thesis (0.01 and 0.002) are meant for many calls per
 goal."""
 STEERING = 1.5
-"""By how much a gait is steered over the angle between the robot and its heading [1/rad]."""
+"""Steering of a gait, over the angle from where the robot faces to its heading [1/rad]."""
 
 
 def make_controller(robot: Robot, task: Task) -> InverseQP:
@@ -168,7 +168,7 @@ class GaitAgent:
 
 
 class SteerAgent:
-    """A rule by hand: the reference gait of the robot, steered in proportion to how far it looks past its heading.
+    """A rule by hand: the reference gait of the robot, steered in proportion to the angle to its heading.
 
     Args:
         seed: not used.

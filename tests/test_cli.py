@@ -204,7 +204,7 @@ STRENGTH = "configs/design/finger_strength.yaml"
         (["rollout", "nowhere:X/Y-v0"], ["environment 'nowhere:X/Y-v0': module 'nowhere' cannot be imported"]),
         (["record", "--robot", "finger"], ["record takes [ENVIRONMENT] NAME, got nothing"]),
         (["evaluate", "--robot", "finger", "environment.backend=fem"], ["changes a configuration: it needs --config"]),
-        (["evaluate", "SoftGym/FingerReach-v0"], ["'SoftGym/FingerReach-v0' has no name; allowed: --environment ID"]),
+        (["evaluate", "SoftGym/FingerReach-v0"], ["'SoftGym/FingerReach-v0' is not KEY=VALUE"]),
         (["rollout", "FingerReach"], ["unknown environment 'FingerReach'; did you mean 'SoftGym/FingerReach-v0'?"]),
         (["rollout", "SoftGym/FingerReach-v0", "--agent", "qpp"], ["unknown agent 'qpp'; did you mean 'qp'?"]),
         (["rollout", "SoftGym/FingerReach-v0", "--seed", "x"], ["--seed", "'x' is not a valid integer"]),

@@ -2,12 +2,13 @@
 
 The policy acts in the environment. Behind each window of control steps, the derivative of the way ahead in that window
 goes back through contact and friction to all commands (`softgym_envs.mechanics.solvers.rollout`), and from there into
-the weights. What the robot will gain after the window is guessed: the way along its heading for as far as it looks in
-that direction. There is no critic and no exploration noise.
+the weights. What the robot will gain after the window is estimated from where it faces then: the closer to its heading,
+the more. There is no critic and no exploration noise.
 
-The derivative is that of commands with which the policy would not react to what they change, apart from commands
-themselves, which it observes: where no command can be improved, both derivatives vanish. Compare Xu et al., Accelerated
-policy learning with parallel differentiable simulation, 2022, who learn a critic in place of the guess.
+The derivative leaves out how the policy reacts to states of the body that its commands change; it contains how it
+reacts to commands, which it observes too. Where no command can be improved, it vanishes as the whole one does. Compare
+Xu et al., Accelerated policy learning with parallel differentiable simulation, 2022, who learn a critic in place of the
+guess.
 """
 
 from __future__ import annotations

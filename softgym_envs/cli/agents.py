@@ -97,7 +97,7 @@ def evaluate(
     if config is not None and not any(others.values()):
         wanted = load_config(config, TrainConfig, overrides).environment
     elif overrides and "=" not in overrides[0]:
-        raise ConfigError(f"'{overrides[0]}' has no name; allowed: --environment ID, --config NAME, or KEY=VALUE")
+        raise ConfigError(f"'{overrides[0]}' is not KEY=VALUE; an environment is named by --environment")
     elif overrides:
         raise ConfigError(f"'{overrides[0]}' changes a configuration: it needs --config, and no other environment")
     else:
