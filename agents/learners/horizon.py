@@ -8,7 +8,7 @@ the more. There is no critic and no exploration noise.
 The derivative leaves out how the policy reacts to states of the body that its commands change; it contains how it
 reacts to commands, which it observes too. Where no command can be improved, it vanishes as the whole one does. Compare
 Xu et al., Accelerated policy learning with parallel differentiable simulation, 2022, who learn a critic in place of the
-guess.
+estimate.
 """
 
 from __future__ import annotations
