@@ -9,7 +9,7 @@ import json
 
 import click
 
-from tests.verification import contact, contact_control, contact_friction, dynamics, infill, side_by_side, statics
+from tests.verification import contact, contact_control, contact_friction, dynamics, side_by_side, statics
 from tests.verification.robot_dynamics import tetrapod
 from tests.verification.walkers import walkers
 
@@ -19,7 +19,6 @@ CHECKS = {
     "dynamics": dynamics.dynamics,
     "tetrapod": tetrapod,
     "side_by_side": side_by_side.side_by_side,
-    "infill": infill.compliances,
     "contact_control": contact_control.contact_control,
     "contact_friction": contact_friction.contact_friction,
     "walkers": walkers,

@@ -1,7 +1,7 @@
-"""Compliant modules with two ports, and structures that are built from them (thesis, sec. 5.2.2).
+"""Compliant modules with two ports, and arms that are built from them (thesis, sec. 5.2.2).
 
-A module is known to the rest of a structure by the compliance between its ports alone, or, for large motions, by its
-energy over their relative motion. So a structure of any number of modules is solved with six unknowns for each port.
+A module is known to the rest of a structure by its energy over the relative motion of its ports alone. So a structure
+of any number of modules is solved with six unknowns for each port.
 """
 
 from typing import TYPE_CHECKING
@@ -12,8 +12,6 @@ if TYPE_CHECKING:
     from softgym_envs.extensions.modules.base import Module as Module
     from softgym_envs.extensions.modules.learned import learned_module as learned_module
     from softgym_envs.extensions.modules.registry import MODULES as MODULES
-    from softgym_envs.extensions.modules.structure import Link as Link
-    from softgym_envs.extensions.modules.structure import Structure as Structure
 
 __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
@@ -21,6 +19,5 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "base": ["Module"],
         "learned": ["learned_module"],
         "registry": ["MODULES"],
-        "structure": ["Link", "Structure"],
     },
 )

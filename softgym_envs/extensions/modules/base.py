@@ -15,7 +15,7 @@ from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.cavity import Cavity
 from softgym_envs.mechanics.constraints.pose import Pose
 from softgym_envs.mechanics.elements.quadratic import add_midside_nodes, quadratic_triangles
-from softgym_envs.mechanics.elements.tetrahedra import SolidOptions, Tetrahedra
+from softgym_envs.mechanics.elements.tetrahedra import Tetrahedra
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.mechanics.surfaces import cavity_around
@@ -129,7 +129,9 @@ class Module(ABC):
             mesh.tetrahedra,
             fixed=clamped,
             element="quadratic",
-            **self.elasticity(complete, rotation),
+            young_modulus=complete["young_modulus"],
+            poisson_ratio=complete["poisson_ratio"],
+            density=DENSITY,
         )
         height = heights(builder.nodes[start:])
         if near is not None:
@@ -143,14 +145,6 @@ class Module(ABC):
             _, quadratic = add_midside_nodes(mesh.nodes, mesh.tetrahedra)
             cavity = start + quadratic_triangles(inside, quadratic)
         return Placed(far, cavity)
-
-    def elasticity(self, design: Mapping[str, float], rotation: np.ndarray) -> SolidOptions:
-        """Return the elasticity of the body of a complete design; the columns of ``rotation`` (3, 3) are its axes."""
-        return {
-            "young_modulus": design["young_modulus"],
-            "poisson_ratio": design["poisson_ratio"],
-            "density": DENSITY,
-        }
 
     def model(self, design: Mapping[str, float] | None = None, *, refine: float = 1.0) -> MechanicalModel:
         """Return the model of a design with the near port clamped.

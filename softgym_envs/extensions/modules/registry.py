@@ -8,7 +8,6 @@ MODULES = Registry(
     "module",
     {
         "solid_block": "softgym_envs.extensions.modules.solid_block:SolidBlock",
-        "printed_block": "softgym_envs.extensions.modules.printed_block:PrintedBlock",
         "leaf_spring": "softgym_envs.extensions.modules.leaf_spring:LeafSpring",
         "crossed_leaves": "softgym_envs.extensions.modules.crossed_leaves:CrossedLeaves",
         "notch_hinge": "softgym_envs.extensions.modules.notch_hinge:NotchHinge",

@@ -61,8 +61,7 @@ def test_any_energy_is_stable_at_rest_and_couples_only_strains_of_a_class(energy
 def test_modules_have_the_symmetry_that_they_state(name):
     """Compliance at rest, in the strains of a superelement; the mesh is not quite symmetric."""
     module = MODULES[name]()
-    design = {"angle": 0.5, "wall_x": 0.2, "wall_y": 0.4} if name == "printed_block" else {}
-    strained = strain_compliance(module, design)
+    strained = strain_compliance(module, {})
     scale = np.sqrt(np.outer(np.diag(strained), np.diag(strained)))
     for signs in reflections(module.symmetry):
         np.testing.assert_allclose(signs[:, None] * strained * signs / scale, strained / scale, atol=0.01)

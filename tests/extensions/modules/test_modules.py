@@ -7,11 +7,8 @@ import pytest
 
 from softgym_envs.errors import DesignError
 from softgym_envs.extensions.deployment.cad import write_drawing
-from softgym_envs.extensions.modules import MODULES, Link, Structure
+from softgym_envs.extensions.modules import MODULES
 from softgym_envs.extensions.modules.base import DENSITY
-from softgym_envs.mechanics.builder import ModelBuilder
-from softgym_envs.mechanics.constraints.pose import Pose
-from softgym_envs.mechanics.solvers.statics import Statics
 
 E = 1.0e7
 NO_POISSON = {"young_modulus": E, "poisson_ratio": 0.0}  # then clamped ends do not stiffen a beam
@@ -60,22 +57,6 @@ def test_a_block_obeys_beam_theory():
         assert found[force, turn] == pytest.approx(size * bending * length / 2.0, rel=1e-3)
         assert found[force, force] == pytest.approx(bending * length**2 / 3.0 + shear, rel=3e-3)
     assert found[Z, Z] == pytest.approx(length / (E * area), rel=1e-6)
-
-
-def test_a_printed_block_is_lighter_softer_and_turns_with_its_lattice():
-    """Along z it has the share of its walls; in other directions less. Full walls give the solid block."""
-    block, solid = MODULES["printed_block"](), MODULES["solid_block"]()
-    slender = {"length": 0.06, "width": 0.01, "depth": 0.01, "poisson_ratio": 0.0}
-    whole = solid.compliance(slender)
-    np.testing.assert_allclose(block.compliance({**slender, "wall_x": 1.0}), whole, rtol=2e-3, atol=1e-6 * whole.max())
-    walls = {"wall_x": 0.2, "wall_y": 0.4}
-    found = block.compliance({**slender, **walls})
-    assert found[2, 2] == pytest.approx(whole[2, 2] / (1.0 - 0.8 * 0.6), rel=1e-3)
-    assert found[5, 5] > whole[5, 5] / 0.52  # torsion shears the lattice
-    turned = block.compliance({**slender, **walls, "angle": np.pi / 2})
-    other = block.compliance({**slender, "wall_x": 0.4, "wall_y": 0.2})
-    scale = np.sqrt(np.outer(np.diag(other), np.diag(other)))
-    np.testing.assert_allclose(turned / scale, other / scale, atol=3e-3)
 
 
 def test_a_tube_twists_by_bredt():
@@ -163,86 +144,6 @@ def test_the_mesh_of_an_accordion_fills_its_drawing():
     wall = thickness * math.hypot(1.0, 4.0 * amplitude / pitch) * folds * pitch
     plates = 2.0 * plate * 2.0 * (amplitude + 2.0 * thickness)
     assert module.mass(design) == pytest.approx(DENSITY * width * (wall + plates), rel=1e-9)
-
-
-def monolith(parts, tip):
-    """Model of modules ``(module, design, near, far, rotation)`` between numbered ports; port 0 is clamped."""
-    builder, frames, places = ModelBuilder(), {0: None}, {0: np.zeros(3)}
-    for module, design, near, far, rotation in parts:
-        length = module.length(module.design_space.complete(design))
-        frames[far] = module.add_to(
-            builder, design, near=frames[near], far=frames.get(far), origin=places[near], rotation=rotation
-        ).far
-        places[far] = places[near] + length * rotation[:, 2]
-    model = builder.build()
-    for component in range(6):
-        model.add("a", Pose(f"tip {component}", frames[tip], component, model.nodes))
-    return model, np.array([places[k] for k in range(len(places))])
-
-
-def test_a_chain_has_the_compliance_of_the_whole_body():
-    leaf, block, notch = (MODULES[name]() for name in ("leaf_spring", "solid_block", "notch_hinge"))
-    parts = [
-        (leaf, {"young_modulus": 2e6}, 0, 1, turned(0.0)),
-        (block, {}, 1, 2, turned(0.0)),
-        (notch, {"neck": 0.003}, 2, 3, turned(0.5 * math.pi)),
-        (leaf, {}, 3, 4, turned(0.3)),
-    ]
-    model, ports = monolith(parts, tip=4)
-    whole = Statics(model).solve(np.zeros(6), "effort").condensed.W.aa
-    links = [Link(near, far, module.compliance(design), turn) for module, design, near, far, turn in parts]
-    found = Structure(ports, links, held=[0]).condensed([4]).W.aa
-    np.testing.assert_allclose(found, whole, rtol=1e-6, atol=1e-8 * abs(whole).max())
-
-
-def test_modules_side_by_side_share_the_load():
-    block = MODULES["solid_block"]()
-    compliance = block.compliance()
-    links = [Link(0, 1, compliance), Link(0, 1, compliance)]
-    found = Structure([[0.0, 0.0, 0.0], [0.0, 0.0, 0.02]], links, held=[0]).condensed().W.aa
-    np.testing.assert_allclose(found, 0.5 * compliance, rtol=1e-9, atol=1e-12 * abs(compliance).max())
-
-
-def random_structure(seed):
-    """A ladder of modules with loops, in random directions."""
-    rng = np.random.default_rng(seed)
-    ports = rng.normal(size=(6, 3))
-    ends = [(0, 1), (1, 2), (2, 3), (3, 4), (4, 5), (5, 0), (1, 4)]
-    links = []
-    for near, far in ends:
-        root = rng.normal(size=(6, 6))
-        rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-        links.append(Link(near, far, root @ root.T + 0.1 * np.eye(6), rotation))
-    return ports, links
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_rigid_motions_of_a_structure_cost_no_energy(seed):
-    ports, links = random_structure(seed)
-    stiffness = Structure(ports, links, held=[0]).stiffness()
-    for translation, turn in zip(np.eye(6)[:, :3], np.eye(6)[:, 3:], strict=True):
-        motion = np.concatenate([np.concatenate([translation + np.cross(turn, port), turn]) for port in ports])
-        assert abs(stiffness @ motion).max() < 1e-12 * abs(stiffness).max()
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_any_structure_is_stable(seed):
-    ports, links = random_structure(seed)
-    model = Structure(ports, links, held=[0, 3]).condensed()
-    assert np.linalg.eigvalsh(model.W.aa).min() > 0.0
-    assert model.rows[6].name == "port 2 x"
-
-
-def test_bad_structures_are_refused():
-    ports, links = random_structure(0)
-    with pytest.raises(ValueError, match="port 7 does not exist"):
-        Structure(ports, [Link(0, 7, np.eye(6))], held=[0])
-    with pytest.raises(ValueError, match="no modules connect port 2"):
-        Structure(ports, links[:1], held=[0, 3, 4, 5])
-    with pytest.raises(ValueError, match="port 0 to port 1 is not positive definite"):
-        Structure(ports, [Link(0, 1, -np.eye(6)), *links[1:]], held=[0])
-    with pytest.raises(ValueError, match="port 0 is held"):
-        Structure(ports, links, held=[0]).condensed([0])
 
 
 def test_modules_are_written_for_printing(tmp_path):
