@@ -25,8 +25,6 @@ PI_GAINS = (0.1, 0.3)
 """Proportional and integral gain per control step. The plant responds to a correction within one step, so the integral
 alone leaves 0.7^k of an error after k steps. The gains of the thesis (0.01 and 0.002) are meant for many calls per
 goal."""
-STEERING = 1.5
-"""Steering of a gait, over the angle from where the robot faces to its heading [1/rad]."""
 
 
 def make_controller(robot: Robot, task: Task) -> InverseQP:
@@ -148,45 +146,6 @@ class CorrectedQPAgent(ModelQPAgent):
         return command
 
 
-class GaitAgent:
-    """The reference gait of the robot, which is the same for all bodies.
-
-    Args:
-        seed: not used.
-    """
-
-    title = "common gait"
-
-    def __init__(self, seed: int = 0) -> None:
-        pass
-
-    def __call__(self, observation: Any, env: Any) -> np.ndarray:
-        """Return the action that leads towards the next command of the gait, shape (n_a,)."""
-        gait = env.robot.reference_gait()
-        action: np.ndarray = env.spaces.action(gait[(env.steps + 1) % len(gait)], env.command)
-        return action
-
-
-class SteerAgent:
-    """A rule by hand: the reference gait of the robot, steered in proportion to the angle to its heading.
-
-    Args:
-        seed: not used.
-    """
-
-    title = "steered gait"
-
-    def __init__(self, seed: int = 0) -> None:
-        pass
-
-    def __call__(self, observation: Any, env: Any) -> np.ndarray:
-        """Return the action that leads towards the next command of the gait, shape (n_a,)."""
-        forwards, left, _ = env.state.nodes[env.robot.body_frame + 1 : env.robot.body_frame + 4] @ env.observed_goal
-        gait = env.robot.steered_gait(np.clip(STEERING * np.arctan2(left, forwards), -1.0, 1.0))
-        action: np.ndarray = env.spaces.action(gait[(env.steps + 1) % len(gait)], env.command)
-        return action
-
-
 class RandomAgent:
     """Uniform actions; those of `Robot.antagonists` are balanced.
 
@@ -216,8 +175,6 @@ BASELINES = Table(
         "qp_static": f"{__name__}:StaticQPAgent",
         "qp_model": f"{__name__}:ModelQPAgent",
         "qp_pi": f"{__name__}:CorrectedQPAgent",
-        "gait": f"{__name__}:GaitAgent",
-        "steer": f"{__name__}:SteerAgent",
         "random": f"{__name__}:RandomAgent",
     },
     group="softgym_envs.agents",
@@ -232,9 +189,8 @@ def make_baseline(name: str, seed: int = 0) -> Agent:
         name: ``"qp"``: inverse QP on the condensed model of the plant's present state, in dynamics of its next time
             step, unless the task names another agent for its goals (`Task.qp_agent`); ``"qp_static"``: on the static
             equilibrium under the present command, without momentum; ``"qp_model"``: on the surrogate, whatever the
-            plant is; ``"qp_pi"``: as ``"qp_model"``, with a PI controller on the measured effector; ``"gait"``: the
-            reference gait of the robot; ``"steer"``: that gait, steered towards a heading; ``"random"``: uniform
-            actions; or one of an installed package.
+            plant is; ``"qp_pi"``: as ``"qp_model"``, with a PI controller on the measured effector; ``"random"``:
+            uniform actions; or one of an installed package.
         seed: seed of the random agent.
 
     Raises:

@@ -9,10 +9,10 @@ import numpy as np
 
 from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
-from softgym_envs.backends.parts import PartsBackend
 from softgym_envs.errors import ConvergenceError
+from softgym_envs.extensions.beams.parts.backends import PartsBackend
+from softgym_envs.extensions.beams.parts.weights import LearnedLeg
 from softgym_envs.extensions.fitting.parts.calibration import compare
-from softgym_envs.surrogate.parts.weights import LearnedLeg
 
 BODIES, CORNERS, MOVING, SEED = 300, 60, 60, 2026
 """New bodies inside the design box and at its corners, bodies in motion, and the seed of all."""

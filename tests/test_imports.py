@@ -35,9 +35,10 @@ LAYERS = [
     {"softgym_envs.viewer"},
     {"softgym_envs.cli"},
     # Extensions: no core package imports one. Those of one layer do not know each other.
-    {"softgym_envs.extensions", "softgym_envs.extensions.checks", "softgym_envs.extensions.design"}
-    | {"softgym_envs.extensions.fitting", "softgym_envs.extensions.report", "softgym_envs.extensions.sweeps"},
+    {"softgym_envs.extensions", "softgym_envs.extensions.beams", "softgym_envs.extensions.checks"}
+    | {"softgym_envs.extensions.design", "softgym_envs.extensions.report", "softgym_envs.extensions.sweeps"},
     {"softgym_envs.testing"},  # helpers of tests, which scripts of users import too
+    {"softgym_envs.extensions.fitting"},
     {
         "softgym_envs.extensions.gpu",
         "softgym_envs.extensions.grasping",
@@ -48,6 +49,7 @@ LAYERS = [
         "softgym_envs.extensions.measured",
         "softgym_envs.extensions.networks",
         "softgym_envs.extensions.sensing",
+        "softgym_envs.extensions.walkers",
     },
     {"softgym_envs.extensions.deployment"},
     {"softgym_envs.extensions.modules"},
@@ -184,7 +186,7 @@ def test_a_step_on_a_surrogate_loads_no_finite_elements(identifier):
 
 
 FEM_LEAVES_OUT = (
-    "contact.contact elements.beams rods skins io solvers.dynamics solvers.beam_body solvers.contact_rows".split()
+    "contact.contact elements.beams rods skins io solvers.dynamics solvers.compiled solvers.contact_rows".split()
 )
 """Modules of mechanics that a step of a solid with cables must not load: 7,000 lines with what they import."""
 

@@ -9,8 +9,6 @@ LEARNERS = Registry(
         "ppo": "softgym_envs.agents.learners.ppo:PPOLearner",
         "analytic": "softgym_envs.agents.learners.analytic:AnalyticLearner",
         "cloning": "softgym_envs.agents.learners.cloning:CloningLearner",
-        "gait": "softgym_envs.agents.learners.gait:GaitLearner",
-        "horizon": "softgym_envs.agents.learners.horizon:HorizonLearner",
     },
     base="softgym_envs.agents.learners.base:Learner",
     group="softgym_envs.learners",

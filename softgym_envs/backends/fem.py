@@ -36,9 +36,8 @@ from softgym_envs.wording import brief, counted
 
 if TYPE_CHECKING:
     from softgym_envs.mechanics.contact.contact import Contact, ContactMemory
-    from softgym_envs.mechanics.solvers.beam_motion import BeamMotion
+    from softgym_envs.mechanics.solvers.compiled import CompiledSolver
     from softgym_envs.mechanics.solvers.dynamics import Dynamics, Motion
-    from softgym_envs.mechanics.solvers.rollout import Rollout
 
 
 SHIFT = 1e-3
@@ -146,15 +145,12 @@ class FEMBackend(Backend):
 
     @classmethod
     def batch_class(cls, robot: Robot, options: Mapping[str, object]) -> str | None:
-        if not robot.made_of_beams or robot.self_contact or options.get("scheme", "euler") != "euler":
+        if not robot.made_of_beams:
             return None
-        if robot.may_touch and not options.get("dynamics", False):
-            return None
-        from softgym_envs.mechanics.contact.obstacles import MeshObstacle
+        from softgym_envs.mechanics.solvers.compiled import SOLVERS
 
-        if any(isinstance(obstacle, MeshObstacle) or obstacle.frame is not None for obstacle in robot.obstacles):
-            return None  # compiled contact knows neither
-        return "softgym_envs.backends.fem_batch:FEMBatch"
+        found = (solver.batch_class(robot, options) for solver in SOLVERS.values())
+        return next((path for path in found if path is not None), None)
 
     @property
     def rest(self) -> State:
@@ -385,45 +381,19 @@ class FEMBackend(Backend):
         return 0 if self._dynamics is None else self._dynamics.max_cuts
 
     @property
-    def beams(self) -> BeamMotion | None:
+    def dynamics(self) -> Dynamics | None:
+        """Time stepping of the present body, for those who know what they change; None in statics."""
+        return self._dynamics
+
+    @property
+    def compiled(self) -> CompiledSolver | None:
         """Compiled solver of the present body; None for a body that needs the general one."""
-        return (self._dynamics or self._statics).beam_solver()
+        return (self._dynamics or self._statics).compiled_solver()
 
     @property
     def not_compiled(self) -> str | None:
         """Why the general solver computes the present body; None for a body of beams that compiled code can solve."""
         return (self._dynamics or self._statics).not_compiled
-
-    def roll_out(self, commands: np.ndarray, forces: np.ndarray | None = None) -> Rollout:
-        """Move the present body under commanded displacements without changing the present state.
-
-        Args:
-            commands: one for each control step, shape (k, n_a).
-            forces: on the first effector in each of them [N], shape (k, 3); default none.
-
-        Returns:
-            The motion, with one entry for each time step, and its gradients; it holds the solver until the next step.
-
-        Raises:
-            ConvergenceError: if a time step cannot be computed.
-            ValueError: without dynamics, or for a body that compiled code cannot solve.
-        """
-        if self._dynamics is None:
-            raise ValueError("roll_out() is that of a motion; make the backend with dynamics=True")
-        from softgym_envs.mechanics.solvers.rollout import roll_out
-
-        kept, start = self._motion, self.state.command
-        try:
-            before = np.vstack([start[None], commands[:-1]])
-            loads = None
-            if forces is not None:
-                loads = np.zeros((len(commands), self.state.effector.size))
-                loads[:, :3] = forces
-                loads = loads.repeat(self.steps.count, axis=0)
-            ramps = np.concatenate([*map(self.steps.ramp, before, commands)])
-            return roll_out(self._dynamics, ramps, forces=loads)
-        finally:
-            self._go_back(kept)
 
     def go_to(
         self,

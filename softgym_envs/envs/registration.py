@@ -84,48 +84,9 @@ ENVIRONMENTS: dict[str, EnvironmentRow] = {
     "SoftGym/DiamondTrack-v0": environment_row("diamond", "track", 100, robot_options={"unilateral": False}),
     "SoftGym/CableTrunkReach-v0": environment_row("cable_trunk", "reach", 50),
     "SoftGym/CableTrunkTrack-v0": environment_row("cable_trunk", "track", 100),
-    "SoftGym/TrunkReach-v0": environment_row("trunk", "reach", 50),
-    "SoftGym/TrunkTrack-v0": environment_row("trunk", "track", 100),
     "SoftGym/FingerPress-v0": environment_row("press_finger", "track", 100),
     "SoftGym/GripperPinch-v0": environment_row("two_finger_gripper", "track", 100),
     "SoftGym/GripperManipulate-v0": environment_row("three_finger_gripper", "track", 100),
-    "SoftGym/TetrapodReach-v0": environment_row("tetrapod", "reach", 100, backend="fem", backend_options=DYNAMIC),
-    "SoftGym/TetrapodTrack-v0": environment_row("tetrapod", "track", 100, backend="fem", backend_options=DYNAMIC),
-    # The goal is beyond the reach of servos that turn by 90 degrees, and coarse legs fold on the way to it.
-    "SoftGym/TetrapodCarry-v0": environment_row(
-        "tetrapod",
-        "carry",
-        100,
-        backend="fem",
-        backend_options=DYNAMIC,
-        robot_options={"mesh": "accurate", "servo_range": 2.8},
-    ),
-    "SoftGym/QuadrupedWalk-v0": environment_row("quadruped", "walk", 100, backend="fem", backend_options=DYNAMIC),
-    "SoftGym/QuadrupedClimb-v0": environment_row(
-        "quadruped",
-        "walk",
-        100,
-        backend="fem",
-        backend_options=DYNAMIC,
-        task_options={"friction": [0.4, 1.2], "slope": [-0.1, 0.2], "payload": 0.03, "push": 0.4, "push_steps": 10},
-    ),
-    "SoftGym/QuadrupedFollow-v0": environment_row(
-        "quadruped",
-        "follow",
-        200,
-        backend="fem",
-        backend_options=DYNAMIC,
-        task_options={"friction": [0.4, 1.2], "push": 0.4, "push_steps": 10},
-    ),
-    "SoftGym/CrawlerWalk-v0": environment_row(
-        "crawler",
-        "walk",
-        100,
-        backend="fem",
-        backend_options=DYNAMIC,
-        task_options={"pace": 0.08, "slip": 0.1, "work": 0.02},
-    ),
-    "SoftGym/SwimmerSwim-v0": environment_row("swimmer", "swim", 100, backend="fem", backend_options=DYNAMIC),
 }
 """All environments of a robot with a task, by ID; `register_environment` and installed packages add to them."""
 

@@ -11,8 +11,8 @@ from softgym_envs import make_robot
 from softgym_envs.backends.backend import Ground
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.envs.env import SoftRobotEnv
-from softgym_envs.envs.tasks.walk import Walk
 from softgym_envs.errors import ConvergenceError
+from softgym_envs.extensions.walkers.tasks.walk import Walk
 
 COMMAND = np.tile([1e-8, -1e-8], 4)
 

@@ -11,10 +11,10 @@ from softgym_envs.codesign import Metric, StudyConfig, load_study, run_study
 from softgym_envs.codesign.metrics.metric import METRICS, find_metric, metric, metric_name
 from softgym_envs.codesign.metrics.sources import Outcome
 from softgym_envs.envs.tasks.reach import Reach
+from softgym_envs.extensions.beams.robots.tetrapod import Tetrapod
 from softgym_envs.extensions.grasping.tasks.grasp import Grasp
 from softgym_envs.extensions.report import write_report
 from softgym_envs.robots.soft_finger import SoftFinger
-from softgym_envs.robots.tetrapod import Tetrapod
 
 ROBOT = make_robot("finger")
 

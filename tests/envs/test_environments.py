@@ -12,9 +12,9 @@ from gymnasium.utils.env_checker import check_env
 import softgym_envs
 from softgym_envs import make_robot
 from softgym_envs.backends.registry import BACKENDS as ALL_BACKENDS
-from softgym_envs.envs.tasks.locomotion import Locomotion
 from softgym_envs.envs.tasks.registry import make_task
 from softgym_envs.errors import ConvergenceError, DesignError
+from softgym_envs.extensions.walkers.tasks.locomotion import Locomotion
 from softgym_envs.robots.base import Robot
 
 BACKENDS = [name for name in ALL_BACKENDS if name != "hardware"]  # which needs a bench

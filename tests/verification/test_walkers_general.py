@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from softgym_envs.extensions.walkers.robots.quadruped import Quadruped
 from softgym_envs.mechanics.solvers.dynamics import Dynamics
-from softgym_envs.robots.quadruped import Quadruped
 
 H, PARTS = 0.01, 5
 """Duration of a time step [s], and time steps of a control step."""

@@ -1,8 +1,8 @@
 """Robots of learned parts in torch: many bodies at once, in equilibrium or in motion, on any device.
 
-The equations are those of `softgym_envs.backends.parts`, from arrays of the same mechanical models: rows of frames,
-coordinates of parts, masses and loads. Every row takes the same few Newton steps on the equilibrium with held servos;
-servos beyond their largest effort are driven by it, as complementary pairs.
+The equations are those of `softgym_envs.extensions.beams.parts.backends`, from arrays of the same mechanical models:
+rows of frames, coordinates of parts, masses and loads. Every row takes the same few Newton steps on the equilibrium
+with held servos; servos beyond their largest effort are driven by it, as complementary pairs.
 """
 
 from __future__ import annotations
@@ -14,6 +14,10 @@ import torch
 from torch import Tensor
 
 from softgym_envs.backends.time_steps import TimeSteps
+from softgym_envs.extensions.beams.parts.energy import LegFunction
+from softgym_envs.extensions.beams.parts.leg import LegScale
+from softgym_envs.extensions.beams.parts.trust import SOFTEST
+from softgym_envs.extensions.beams.parts.weights import of_learned_parts
 from softgym_envs.extensions.gpu.surrogates import Bodies
 from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.constraints.servo import Servo
@@ -21,10 +25,6 @@ from softgym_envs.mechanics.elements.parts import PoseParts, tip_stiffness
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import Robot
-from softgym_envs.surrogate.parts.energy import LegFunction
-from softgym_envs.surrogate.parts.leg import LegScale
-from softgym_envs.surrogate.parts.trust import SOFTEST
-from softgym_envs.surrogate.parts.weights import of_learned_parts
 
 NEWTON_STEPS, MAX_NEWTON_STEPS = 4, 25
 """Newton steps of every row in a time step, and of rows that take more."""

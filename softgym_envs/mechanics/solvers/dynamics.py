@@ -275,10 +275,10 @@ class Dynamics(Statics):
         Returns:
             How many of the time steps were taken, and the last one if all were.
         """
-        beams, load = self.beam_solver(), applied.get("effector_force")
+        special, load = self.compiled_solver(), applied.get("effector_force")
         modes = [mode] * self._actuators if isinstance(mode, str) else list(mode)
         known = len(modes) == self._actuators and all(m in ("displacement", "effort") for m in modes)
-        if beams is None or not known or applied.get("contact") is not None or targets.shape[1] != self._actuators:
+        if special is None or not known or applied.get("contact") is not None or targets.shape[1] != self._actuators:
             return 0, None
         is_driven = np.zeros(len(self.effort), dtype=bool)
         is_driven[: self._actuators] = [m == "displacement" for m in modes]
@@ -294,7 +294,7 @@ class Dynamics(Statics):
         if not np.isfinite(goals).all():
             return 0, None
         loads = self.model.loads
-        found = beams.march(
+        found = special.march(
             self.x,
             self.velocity,
             self.effort,

@@ -31,8 +31,8 @@ from softgym_envs.mechanics.surfaces import ShapeCheck
 
 if TYPE_CHECKING:
     from softgym_envs.mechanics.contact.contact import ContactMemory
-    from softgym_envs.mechanics.solvers.beam_motion import BeamMotion
     from softgym_envs.mechanics.solvers.cable_friction import CableMemory
+    from softgym_envs.mechanics.solvers.compiled import CompiledSolver
 
 
 @explained
@@ -46,7 +46,7 @@ class Statics(Newton):
         max_halvings: the smallest load increment is ``0.5 ** max_halvings`` of the whole step.
         exact_compliance: compute ``W`` and stability at each equilibrium. Otherwise they may be those of the last
             iterate, which saves a factorisation; without friction, `exact_at` computes them later.
-        compiled: solve bodies of beams in compiled code (`BeamMotion`) where that is fast; the equilibria are the same.
+        compiled: use the compiled solver of an installed package where one knows the body; the equilibria are the same.
 
     Attributes:
         x: current node positions [m], shape (n, 3), and ``effort``: current efforts of all rows, shape (size,).
@@ -78,7 +78,7 @@ class Statics(Newton):
         self._layout, self._shape = RowLayout.of(model), ShapeCheck.of(model)
         self._compiled = self._asked = compiled
         self._lumped = False
-        self._beams: BeamMotion | None = None
+        self._special: CompiledSolver | None = None
         self.reset()
 
     def reset(self) -> None:
@@ -274,39 +274,41 @@ class Statics(Newton):
             conditions=None if linear.located else Conditions(linear.loads, self._elasticity_version),
         )
 
-    # -- bodies of beams --------------------------------------------------------------------------------------------
+    # -- compiled solvers -------------------------------------------------------------------------------------------
 
-    def beam_solver(self) -> BeamMotion | None:
+    def compiled_solver(self) -> CompiledSolver | None:
         """Return the compiled solver of the body, or None if it needs the general one."""
         if not self._compiled or self.model.assembly is not self._assembly:
             return None
-        if self._beams is None or self._beams.elasticity_version != self.model.elasticity_version:
-            if self.not_compiled is not None:
+        if self._special is None or self._special.elasticity_version != self.model.elasticity_version:
+            from softgym_envs.mechanics.solvers.compiled import compiled_solver
+
+            found = compiled_solver(self.model, moving=self._moving)
+            if isinstance(found, str):
                 self._compiled = False
                 return None
-            from softgym_envs.mechanics.solvers.beam_motion import BeamMotion
-
-            self._beams = BeamMotion(self.model, self._assembly.mass_matrix(self._lumped))
-        return self._beams
+            self._special = found(self.model, self._assembly.mass_matrix(self._lumped))
+        return self._special
 
     @property
     def not_compiled(self) -> str | None:
         """Why the general solver computes this body, which takes far longer; None where compiled code does."""
         if not self._asked:
             return "compiled code was not asked for, or the scheme is not 'euler'"
-        if len(self.model.solids) == len(self.model.blocks):
-            return "it has no beams"
-        from softgym_envs.mechanics.solvers.beam_body import reason_for_general
+        from softgym_envs.mechanics.solvers.compiled import compiled_solver
 
-        return reason_for_general(self.model, moving=self._moving)
+        found = compiled_solver(self.model, moving=self._moving)
+        return found if isinstance(found, str) else None
 
     def _balance(self, goal: np.ndarray, driven: np.ndarray) -> Equilibrium | None:
         """Find the equilibrium for commanded rows (size,) in compiled code; None where the general solver is needed."""
-        beams, loads = self.beam_solver(), self.model.loads
+        special, loads = self.compiled_solver(), self.model.loads
         ramped = bool((loads != self.linearisation.loads).any())
-        if beams is None or ramped or self.linearisation.inertia is not None or (driven >= self._actuators).any():
+        if special is None or ramped or self.linearisation.inertia is not None or (driven >= self._actuators).any():
             return None
-        found = beams.balance(self.x, self.effort, goal, driven, self.unilateral, loads=loads, tolerance=self.tolerance)
+        found = special.balance(
+            self.x, self.effort, goal, driven, self.unilateral, loads=loads, tolerance=self.tolerance
+        )
         if not found.solved:
             return None
         self.x, self.effort = found.x, found.effort.copy()

@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from softgym_envs.robots.tetrapod import Tetrapod
+from softgym_envs.extensions.beams.robots.tetrapod import Tetrapod
 
 torch = pytest.importorskip("torch")
 from softgym_envs.extensions.gpu.environment import TorchVectorEnv  # noqa: E402

@@ -1,1 +1,1 @@
-"""Fitting of learned parts (`softgym_envs.surrogate.parts`)."""
+"""Fitting of learned parts (`softgym_envs.extensions.beams.parts`)."""

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
+from softgym_envs.extensions.beams.parts.trust import Judged, judge
+from softgym_envs.extensions.beams.parts.weights import LearnedLeg
 from softgym_envs.extensions.fitting.calibration import conformal_quantile
 from softgym_envs.extensions.fitting.data.strata import draw_commands
 from softgym_envs.mechanics.condensation import CondensedModel
@@ -18,8 +20,6 @@ from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import Robot
 from softgym_envs.storage import read_json, write_json
 from softgym_envs.surrogate.domain import SOFT
-from softgym_envs.surrogate.parts.trust import Judged, judge
-from softgym_envs.surrogate.parts.weights import LearnedLeg
 
 INCREMENTS = 20
 """Increments in which a command is approached from rest: of several equilibria both models are to find the same."""

@@ -7,15 +7,15 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse import csr_matrix
 
+from softgym_envs.extensions.beams.robots.tetrapod import POISSON_RATIO, printed_leg
+from softgym_envs.extensions.beams.solver.block_cholesky import factorise, solve_lower, solve_upper
+from softgym_envs.extensions.beams.solver.body import beam_body
+from softgym_envs.extensions.beams.solver.equations import Step, assemble, make_equations
+from softgym_envs.extensions.beams.solver.frames import move, orthonormalise
 from softgym_envs.mechanics.assembly import MassMatrix
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.compilation import njit
 from softgym_envs.mechanics.elements.beams import Beam, Section
-from softgym_envs.mechanics.solvers.beam_body import beam_body
-from softgym_envs.mechanics.solvers.beam_equations import Step, assemble, make_equations
-from softgym_envs.mechanics.solvers.beam_frames import move, orthonormalise
-from softgym_envs.mechanics.solvers.block_cholesky import factorise, solve_lower, solve_upper
-from softgym_envs.robots.tetrapod import POISSON_RATIO, printed_leg
 
 HOLD = 1e9
 """Stiffness of the springs that hold the tip; the leg's own is of order 1 to 1e5."""

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import torch
 from torch import Tensor
 
-from softgym_envs.surrogate.parts.jets import HALF_PI
-from softgym_envs.surrogate.parts.pose import (
+from softgym_envs.extensions.beams.parts.jets import HALF_PI
+from softgym_envs.extensions.beams.parts.pose import (
     EVEN,
     FORM_SCALE,
     OFFSET_SCALE,

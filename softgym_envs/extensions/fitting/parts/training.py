@@ -12,13 +12,13 @@ import numpy as np
 from pydantic import Field
 
 from softgym_envs.config import Config
+from softgym_envs.extensions.beams.parts.pose import PLACE, TURN, WEIGHT
+from softgym_envs.extensions.beams.parts.weights import LegDomain, card_of_leg, write_leg
 from softgym_envs.extensions.fitting.parts.data import LegStates, held_states, swing_poses
 from softgym_envs.extensions.fitting.trainer import Trainer, TrainingOptions
 from softgym_envs.extras import require
 from softgym_envs.runs import RunFolder
 from softgym_envs.storage import atomic_write
-from softgym_envs.surrogate.parts.pose import PLACE, TURN, WEIGHT
-from softgym_envs.surrogate.parts.weights import LegDomain, card_of_leg, write_leg
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -1,0 +1,1 @@
+"""Robots made of beams that are held: Stiff-Flop and Tetrapod."""

@@ -1,0 +1,1 @@
+"""The compiled solver of bodies made of quadratic beams and rigid parts."""

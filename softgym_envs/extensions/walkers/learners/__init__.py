@@ -1,0 +1,1 @@
+"""Learners along gradients through time."""
