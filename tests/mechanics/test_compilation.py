@@ -11,7 +11,7 @@ import pytest
 
 from softgym_envs.mechanics import compilation
 
-MECHANICS = compilation.ROOT / "mechanics"
+PACKAGE = compilation.ROOT
 KERNEL = """
 from tiny.mechanics.compilation import njit
 
@@ -81,18 +81,18 @@ def printed(module, folder):
 @pytest.mark.parametrize(
     ("file", "depends"),
     [
-        ("solvers/beam_batch.py", True),
-        ("solvers/beam_motion.py", True),
-        ("elements/beam_kernels.py", True),  # over beam_equations
-        ("solvers/equilibrium.py", True),  # constants
-        ("contact/obstacles.py", True),  # its classes are named beside the kernels of contact
-        ("solvers/statics.py", False),
+        ("extensions/beams/solver/batch.py", True),
+        ("extensions/beams/solver/motion.py", True),
+        ("mechanics/elements/beam_kernels.py", True),  # over equations
+        ("mechanics/solvers/equilibrium.py", True),  # constants
+        ("mechanics/contact/obstacles.py", True),  # its classes are named beside the kernels of contact
+        ("mechanics/solvers/statics.py", False),
     ],
 )
 def test_kernels_depend_on_the_files_that_their_code_comes_from(edited, file, depends):
-    path = MECHANICS / "solvers/beam_batch.py"
+    path = PACKAGE / "extensions/beams/solver/batch.py"
     before = compilation.source_hash(path)
-    edited(MECHANICS / file)
+    edited(PACKAGE / file)
     assert (compilation.source_hash(path) != before) == depends
 
 

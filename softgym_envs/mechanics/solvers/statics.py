@@ -278,7 +278,8 @@ class Statics(Newton):
 
     def compiled_solver(self) -> CompiledSolver | None:
         """Return the compiled solver of the body, or None if it needs the general one."""
-        if not self._compiled or self.model.assembly is not self._assembly:
+        solid = len(self.model.solids) == len(self.model.blocks)
+        if solid or not self._compiled or self.model.assembly is not self._assembly:
             return None
         if self._special is None or self._special.elasticity_version != self.model.elasticity_version:
             from softgym_envs.mechanics.solvers.compiled import compiled_solver
