@@ -22,12 +22,10 @@ from softgym_envs.codesign.parts import (
 )
 from softgym_envs.codesign.problem import StudyProblem, refuse
 from softgym_envs.codesign.sampling import SamplerConfig
+from softgym_envs.codesign.scheduling.storage import JOURNAL, find_storage
 from softgym_envs.codesign.variables import is_option
 from softgym_envs.config import BesideConfig
 from softgym_envs.envs.tasks.reach import Reach
-
-JOURNAL = "journal"
-"""``storage`` of a study whose folder keeps the trials."""
 
 
 class StudyConfig(StudyProblem):
@@ -88,18 +86,10 @@ class StudyConfig(StudyProblem):
     def _known_storage(cls, storage: str) -> str:
         if storage == JOURNAL:
             return storage
-        from sqlalchemy.engine import make_url
-        from sqlalchemy.exc import ArgumentError
-
         user = storage.partition("://")[2].rpartition("@")[0]
         if ":" in user or re.search(r"pass|pwd|secret|token", storage.partition("?")[2], re.IGNORECASE):
             raise ValueError("remove the password: the address is written to files; use ~/.pgpass or PGPASSWORD")
-        try:
-            url = make_url(storage)
-        except (ArgumentError, ValueError):
-            raise ValueError(f"allowed: {JOURNAL}, postgresql://user@host:port/database") from None
-        if url.get_backend_name() != "postgresql" or not url.database:
-            raise ValueError(f"allowed: {JOURNAL}, postgresql://user@host:port/database")
+        find_storage(storage)
         return storage
 
     @model_validator(mode="after")

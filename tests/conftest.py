@@ -22,8 +22,8 @@ from softgym_envs.mechanics.materials import MATERIALS
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.registry import ALLOW_CODE
-from softgym_envs.testing import box_mesh, train_small_surrogate
 from tests.hang_guard import end_if_hung
+from tests.helpers import box_mesh, train_small_surrogate
 
 # The same examples on every machine, however busy it is.
 settings.register_profile("softgym", deadline=None, derandomize=True)

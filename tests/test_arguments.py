@@ -17,7 +17,7 @@ from softgym_envs.mechanics.contact.contact import ContactSettings
 from softgym_envs.mechanics.io import read_mesh
 from softgym_envs.mechanics.solvers.dynamics import Dynamics
 from softgym_envs.robots import Actuator
-from softgym_envs.testing import box_mesh
+from tests.helpers import box_mesh
 from tests.test_units import Bar
 
 NODES, TETRAHEDRA = box_mesh((0.1, 0.02, 0.02), (2, 1, 1))

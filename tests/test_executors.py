@@ -10,7 +10,7 @@ import sys
 import pytest
 
 from softgym_envs.executors import parallel_map
-from softgym_envs.testing import live_processes, wait_until
+from tests.helpers import live_processes, wait_until
 
 # Functions of the standard library: workers cannot import test files.
 SQUARES = [(k, k) for k in range(20)]

@@ -25,7 +25,7 @@ from softgym_envs.mechanics.contact.obstacles import MeshObstacle, Plane, Sphere
 from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.quantities import QUANTITIES, check_quantity, check_unit
 from softgym_envs.robots import Actuator, Robot
-from softgym_envs.testing import box_mesh
+from tests.helpers import box_mesh
 
 NODES, TETRAHEDRA = box_mesh((0.1, 0.02, 0.02), (4, 1, 1))
 

@@ -32,7 +32,7 @@ from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.robots import Actuator, Robot
 from softgym_envs.storage import cache_directory
-from softgym_envs.testing import box_mesh
+from tests.helpers import box_mesh
 
 ROOT = Path(__file__).resolve().parent.parent
 NODES, TETRAHEDRA = box_mesh((0.1, 0.02, 0.02), (4, 1, 1))

@@ -1,11 +1,11 @@
-"""Opening the storage that a configuration names. Only this module knows which storages there are."""
+"""Opening the storage that a configuration names."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from softgym_envs.codesign.config import JOURNAL, StudyConfig
-from softgym_envs.codesign.scheduling.storage import StudyStorage
+from softgym_envs.codesign.config import StudyConfig
+from softgym_envs.codesign.scheduling.storage import JOURNAL, StudyStorage, find_storage
 
 
 def open_storage(folder: Path, config: StudyConfig, *, wait: bool = True) -> StudyStorage:
@@ -17,6 +17,7 @@ def open_storage(folder: Path, config: StudyConfig, *, wait: bool = True) -> Stu
         from softgym_envs.codesign.scheduling.journal import JournalStorage
 
         return JournalStorage(folder, config.name)
-    from softgym_envs.codesign.scheduling.postgres import PostgresStorage
-
-    return PostgresStorage(config.storage, config.name, grace=config.heartbeat, patience=config.patience, wait=wait)
+    storage: StudyStorage = find_storage(config.storage)(
+        config.storage, config.name, grace=config.heartbeat, patience=config.patience, wait=wait
+    )
+    return storage

@@ -1,7 +1,7 @@
 """Storage and locks of a study: what its processes share.
 
 `softgym_envs.codesign.scheduling.journal.JournalStorage` keeps trials in the folder of the study, for the processes of
-one machine. `softgym_envs.codesign.scheduling.postgres.PostgresStorage` keeps them in a database, for many machines.
+one machine. Storages for many machines, such as a database, are those of installed packages (`STORAGES`).
 """
 
 from __future__ import annotations
@@ -12,11 +12,15 @@ from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from softgym_envs.codesign.metrics.metric import Direction
+from softgym_envs.registry import Registry
 
 if TYPE_CHECKING:
     import optuna
 
 T = TypeVar("T")
+
+JOURNAL = "journal"
+"""``storage`` of a study whose folder keeps the trials."""
 
 
 class StudyStorage(ABC):
@@ -72,9 +76,28 @@ class StudyStorage(ABC):
 
 
 class SharedStorage(StudyStorage):
-    """A storage for many machines."""
+    """A storage for many machines.
+
+    Args:
+        address: ``scheme://...``, where the scheme is the name of the storage.
+        study: name of the study.
+        grace: time without a heartbeat after which a worker counts as dead [s].
+        patience: how long to wait for a server that does not answer [s].
+        wait: whether to wait for the server when the storage is opened.
+    """
 
     shared = True
+    form: str  # of addresses, for messages
+
+    @abstractmethod
+    def __init__(
+        self, address: str, study: str, *, grace: float = 60.0, patience: float = 600.0, wait: bool = False
+    ) -> None: ...
+
+    @classmethod
+    @abstractmethod
+    def takes(cls, address: str) -> bool:
+        """Return whether an address, which may be any text, is one of this storage."""
 
     @abstractmethod
     def agree(
@@ -89,3 +112,22 @@ class SharedStorage(StudyStorage):
     @abstractmethod
     def has_files(self, folder: str) -> bool:
         """Return whether a folder of the study has published files."""
+
+
+STORAGES = Registry(
+    "storage", {}, base="softgym_envs.codesign.scheduling.storage:SharedStorage", group="softgym_envs.storages"
+)
+"""Storages for many machines of installed packages, by the scheme of their addresses."""
+
+
+def find_storage(address: str) -> type[SharedStorage]:
+    """Return the storage for many machines that takes an address.
+
+    Raises:
+        ValueError: if none does; the message does not repeat the address, which may hold a password.
+    """
+    for storage in STORAGES.values():
+        if storage.takes(address):
+            found: type[SharedStorage] = storage
+            return found
+    raise ValueError(f"allowed: {', '.join([JOURNAL, *(storage.form for storage in STORAGES.values())])}")

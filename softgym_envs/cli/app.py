@@ -29,7 +29,6 @@ SECTIONS = {
     "Environments": {
         "list": "environments:list_",
         "rollout": "environments:rollout",
-        "record": "environments:record",
         "view": "environments:view",
     },
     "Robots": {

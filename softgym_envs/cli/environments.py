@@ -1,4 +1,4 @@
-"""Verbs for environments: list, rollout, record, view."""
+"""Verbs for environments: list, rollout, view."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ import click
 from softgym_envs.cli import options
 from softgym_envs.errors import ConfigError
 from softgym_envs.extras import require
+from softgym_envs.registry import import_object
 from softgym_envs.wording import counted
 
 if TYPE_CHECKING:
@@ -143,8 +144,7 @@ def list_(as_json: bool) -> None:
 @click.option("--seed", default=0, show_default=True, help="Seed of the episode.")
 @click.option("--record", type=options.PATH, help="Write a rerun recording (.rrd) to this file.")
 @click.option("--video", type=options.PATH, help="Write a film (.mp4, .gif or .webp) to this file.")
-@click.option("--paraview", type=options.PATH, help="Write a time series for ParaView to this folder.")
-@click.option("--glb", type=options.PATH, help="Write an animation for Blender and browsers (.glb) to this file.")
+@options.writers
 def rollout(
     environment: str | None,
     agent: str,
@@ -153,8 +153,6 @@ def rollout(
     seed: int,
     record: Path | None,
     video: Path | None,
-    paraview: Path | None,
-    glb: Path | None,
     **chosen: Any,
 ) -> dict[str, Any]:
     """Run one episode and print its result.
@@ -165,15 +163,15 @@ def rollout(
     import softgym_envs  # noqa: F401 - registers the IDs
     from softgym_envs.agents.evaluation import check_agent, make_agent
     from softgym_envs.surrogate.domain import distrust_text
-    from softgym_envs.viewer.gltf import GlbWriter
-    from softgym_envs.viewer.moment import Watcher
-    from softgym_envs.viewer.paraview import ParaviewWriter
+    from softgym_envs.viewer.moment import WRITERS, Watcher
     from softgym_envs.viewer.recording import Filmed, recorder_of, watch_rollout
 
     if record is not None and record.suffix != ".rrd":
         raise ConfigError(f"recording '{record}' must end with .rrd; --video writes films")
-    if glb is not None and glb.suffix != ".glb":
-        raise ConfigError(f"animation '{glb}' must end with .glb")
+    written: dict[str, Path] = {name: path for name in WRITERS if (path := chosen.pop(name)) is not None}
+    for name, path in written.items():
+        if (suffix := WRITERS[name].suffix) and path.suffix != suffix:
+            raise ConfigError(f"file '{path}' of --{name} must end with {suffix}")
     if video is not None:
         from softgym_envs.viewer.video import check_video, write_video
 
@@ -190,10 +188,9 @@ def rollout(
         if record is not None:
             watchers.append(open_files.enter_context(recorder_of(env, record)))
         robot = env.unwrapped.robot  # type: ignore[attr-defined]
-        if paraview is not None:
-            watchers.append(open_files.enter_context(ParaviewWriter(robot, paraview)))
-        if glb is not None:
-            watchers.append(open_files.enter_context(GlbWriter(robot, glb)))
+        for name, path in written.items():
+            writer = import_object("writer of episodes", WRITERS[name].place)
+            watchers.append(open_files.enter_context(writer(robot, path)))
         if video is not None:
             watchers.append(Filmed(env, frames))
         summary = watch_rollout(env, act, watchers, seed=seed)
@@ -212,50 +209,11 @@ def rollout(
         click.echo(f"wrote {video}")
     if record is not None:
         click.echo(f"wrote {record}; open it with 'softgym view {record}'")
-    if paraview is not None:
-        click.echo(f"wrote {paraview}; open its .pvd files with ParaView")
-    if glb is not None:
-        click.echo(f"wrote {glb}")
+    for name, path in written.items():
+        hint = WRITERS[name].hint
+        click.echo(f"wrote {path}{hint and '; '}{hint}")
     env.close()
     return {**summary, "backend": config.backend, "seed": seed}
-
-
-@click.command()
-@click.argument("names", nargs=-1, metavar="[ENVIRONMENT] NAME")
-@options.environment
-@click.option("--agent", default="qp", show_default=True, help=AGENT_HELP)
-@click.option("--backend", help="surrogate, hybrid or fem (default: the environment's).")
-@options.design
-@click.option("--episodes", default=100, show_default=True, help="Number of episodes.")
-@click.option("--seed", default=0, show_default=True, help="Seed of the first episode; the next ones add 1 each.")
-def record(
-    names: tuple[str, ...],
-    agent: str,
-    backend: str | None,
-    design: tuple[str, ...],
-    episodes: int,
-    seed: int,
-    **chosen: Any,
-) -> None:
-    """Record episodes as a Minari dataset, for offline learning.
-
-    NAME is the name of the dataset, such as softgym/finger-reach/qp-v0. ENVIRONMENT as for rollout.
-    """
-    import softgym_envs  # noqa: F401 - registers the IDs
-    from softgym_envs.agents.evaluation import check_agent
-    from softgym_envs.agents.offline import record_episodes
-
-    if episodes < 1:
-        raise ConfigError(f"--episodes {episodes} must be at least 1")
-    if not 1 <= len(names) <= 2:
-        raise ConfigError(f"record takes [ENVIRONMENT] NAME, got {' '.join(names) or 'nothing'}")
-    check_agent(agent)
-    id, name = names if len(names) == 2 else (None, names[0])
-    config = environment_of_agents("record", (agent,), backend, id=id, **chosen)
-    body = options.design_of(design) or None
-    dataset = record_episodes(name, agent, config, episodes=episodes, design=body, seed=seed)
-    episodes_text, steps_text = counted(dataset.total_episodes, "episode"), counted(dataset.total_steps, "step")
-    click.echo(f"wrote {episodes_text}, {steps_text}: minari.load_dataset('{name}')")
 
 
 @click.command()

@@ -105,6 +105,15 @@ def environment(command: Callable) -> Callable:
     return command
 
 
+def writers(command: Callable) -> Callable:
+    """Add an option for each `softgym_envs.viewer.moment.EpisodeWriter` of installed packages."""
+    from softgym_envs.viewer.moment import WRITERS
+
+    for name in sorted(WRITERS):
+        command = click.option(f"--{name}", type=PATH, help=WRITERS[name].help)(command)
+    return command
+
+
 def values_of(option: str, pairs: tuple[str, ...]) -> dict[str, Any]:
     """Return the values of ``--option name=value``, read as in a configuration file.
 

@@ -17,8 +17,6 @@ ROBOTS = Registry(
         "cable_trunk": "softgym_envs.robots.cable_trunk:CableTrunk",
         "press_finger": "softgym_envs.robots.grippers:PressFinger",
         "two_finger_gripper": "softgym_envs.robots.grippers:TwoFingerGripper",
-        "two_finger_friction_gripper": "softgym_envs.robots.friction_grippers:TwoFingerFrictionGripper",
-        "three_finger_friction_gripper": "softgym_envs.robots.friction_grippers:ThreeFingerFrictionGripper",
         "three_finger_gripper": "softgym_envs.robots.grippers:ThreeFingerGripper",
     },
     base="softgym_envs.robots.base:Robot",

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from softgym_envs.backends.backend import State
+from softgym_envs.registry import Table
+
+if TYPE_CHECKING:
+    from softgym_envs.backends.backend import State
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,27 @@ class Moment:
     path: np.ndarray | None = None
     reward: float | None = None
     distance: float | None = None
+
+
+@dataclass(frozen=True)
+class EpisodeWriter:
+    """An option of ``softgym rollout`` that writes the episode to a file or folder.
+
+    Attributes:
+        place: ``"module:class"`` of a `Watcher` and context manager that takes the robot and the path.
+        help: of the option.
+        suffix: with which files end; none for a folder.
+        hint: what to do with what was written.
+    """
+
+    place: str
+    help: str
+    suffix: str = ""
+    hint: str = ""
+
+
+WRITERS = Table("writer of episodes", {}, group="softgym_envs.writers")
+"""`EpisodeWriter` of installed packages, by the name of the option."""
 
 
 class Watcher(Protocol):

@@ -78,7 +78,7 @@ class Sweep:
         self._context.set_forkserver_preload(
             [
                 "softgym_envs.codesign.scheduling.worker",
-                "softgym_envs.codesign.scheduling.postgres",
+                "softgym_envs.extensions.postgres.storage",
                 "softgym_envs.agents.evaluation",
                 "optuna",
                 "psycopg",

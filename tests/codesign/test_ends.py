@@ -26,7 +26,7 @@ from softgym_envs.extensions.report.episodes import MOMENTS, moments
 from softgym_envs.extensions.report.findings import findings
 from softgym_envs.extensions.report.page import write_report
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.testing import wait_until
+from tests.helpers import wait_until
 
 POLICY = "diamond_reach_designs"
 FINER = {"robot_options": {"mesh_size": 0.0065}, "goals": 2}

@@ -24,8 +24,8 @@ from softgym_envs.codesign.scheduling.worker import run_trials
 from softgym_envs.codesign.snapshot import load_study
 from softgym_envs.codesign.study import run_study
 from softgym_envs.errors import DataError, MeshingError, SoftGymError
-from softgym_envs.testing import wait_until
 from tests.codesign.kills import Sweep, faults
+from tests.helpers import wait_until
 
 SMALL = {"count": 2, "unseen_count": 2, "training_count": 2}
 

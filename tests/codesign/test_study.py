@@ -25,8 +25,8 @@ from softgym_envs.codesign.statistics import kendall_tau, mean_interval, rank_co
 from softgym_envs.codesign.study import run_study
 from softgym_envs.errors import WeightsError
 from softgym_envs.extensions.report.page import write_report
-from softgym_envs.testing import wait_until
 from tests.accessibility import defects
+from tests.helpers import wait_until
 
 TRIALS = 7
 

@@ -19,9 +19,9 @@ from softgym_envs.envs.tasks.registry import TASKS, register_task
 from softgym_envs.envs.vector_env import SoftRobotVectorEnv
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.robots.soft_finger import SoftFinger
-from softgym_envs.testing import Spike
+from tests.helpers import Spike
 
-ROBOT = "softgym_envs.testing:Spike"
+ROBOT = "tests.helpers:Spike"
 
 
 class Approach(Reach):

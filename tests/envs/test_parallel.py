@@ -14,7 +14,7 @@ from softgym_envs.agents import SB3VecEnv
 from softgym_envs.envs.parallel import ParallelVectorEnv
 from softgym_envs.envs.vector_env import SoftRobotVectorEnv
 from softgym_envs.errors import DesignError, InfeasibleDesign
-from softgym_envs.testing import wait_until
+from tests.helpers import wait_until
 
 FINGER = "SoftGym/FingerReach-v0"
 

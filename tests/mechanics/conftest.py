@@ -6,7 +6,7 @@ import pytest
 
 from softgym_envs.mechanics.materials import MATERIALS
 from softgym_envs.mechanics.solids import SOLIDS
-from softgym_envs.testing import clamped_beam, clamped_solid, dense_tangent, derivative_errors
+from tests.helpers import clamped_beam, clamped_solid, dense_tangent, derivative_errors
 from tests.mechanics.superelements import clamped_superelements
 
 BODIES = [f"{element}-{material}" for element in SOLIDS for material in MATERIALS] + [

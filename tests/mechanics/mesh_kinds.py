@@ -13,7 +13,7 @@ from typing import Any
 import meshio
 import numpy as np
 
-from softgym_envs.testing import box_mesh
+from tests.helpers import box_mesh
 
 SIZE = (60.0, 20.0, 20.0)
 VOLUME = 24e-6

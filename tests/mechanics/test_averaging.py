@@ -8,7 +8,7 @@ import pytest
 from softgym_envs.mechanics.elements.quadratic import add_midside_nodes
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.testing import box_mesh, clamped_solid
+from tests.helpers import box_mesh, clamped_solid
 
 PLACES = np.array([[0.01, 0.01, 0.015], [0.004, 0.012, 0.03], [0.02, 0.0, 0.01]])
 """In the middle, on the top face and on an edge of the block of `clamped_solid` [m]."""

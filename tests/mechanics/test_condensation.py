@@ -233,7 +233,7 @@ def test_units_of_pressure_and_angles():
 
 
 def test_fem_and_surrogate_name_their_rows_alike(fingers):
-    from softgym_envs.testing import untrained_potential
+    from tests.helpers import untrained_potential
 
     robot, model = fingers(2, "corotational")
     surrogate, _ = untrained_potential(robot)

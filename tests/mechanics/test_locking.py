@@ -15,7 +15,7 @@ from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.locking import LockingWarning, missing_compliance
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.testing import box_mesh
+from tests.helpers import box_mesh
 
 skfem = pytest.importorskip("skfem")
 from skfem.helpers import ddot, eye, sym_grad, trace  # noqa: E402

@@ -11,7 +11,7 @@ from softgym_envs.mechanics.constraints.bond import Bond
 from softgym_envs.mechanics.elements.quadratic import add_midside_nodes
 from softgym_envs.mechanics.mesh_checks import check_held, check_mesh, merge_nodes
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.testing import box_mesh
+from tests.helpers import box_mesh
 
 SIZE = (0.1, 0.02, 0.02)
 BAR = box_mesh(SIZE, (4, 2, 2))

@@ -10,7 +10,7 @@ from softgym_envs.mechanics.materials import MATERIALS
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.registry import make_robot
-from softgym_envs.testing import dense_tangent
+from tests.helpers import dense_tangent
 
 ONE_TETRAHEDRON = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 

@@ -9,7 +9,7 @@ from softgym_envs.mechanics.constraints.cavity import ATMOSPHERE, SealedAir
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.mechanics.surfaces import cavity_around
-from softgym_envs.testing import derivative_errors
+from tests.helpers import derivative_errors
 
 SIDE = 0.03
 MIDDLE = np.array([0.5, 0.5, 0.5]) * SIDE

@@ -15,7 +15,7 @@ from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.dynamics import Dynamics
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.mechanics.surfaces import CrossingWarning, ShapeCheck, self_intersection
-from softgym_envs.testing import box_mesh
+from tests.helpers import box_mesh
 
 INSIDE = [0.03, 0.03, 0.00275]
 

@@ -17,7 +17,7 @@ from softgym_envs.surrogate.correction import HIGHEST_ORDER, LOWEST_ORDER, Effor
 from softgym_envs.surrogate.potential.model import Model
 from softgym_envs.surrogate.potential.torch import TorchModel
 from softgym_envs.surrogate.pretrained import pretrained_folder
-from softgym_envs.testing import random_states, untrained_potential
+from tests.helpers import random_states, untrained_potential
 
 SIZES = (5.0, 3.0, 2.0)
 

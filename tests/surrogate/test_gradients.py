@@ -6,7 +6,7 @@ import torch
 
 from softgym_envs import make_robot
 from softgym_envs.surrogate.potential.torch import TorchModel
-from softgym_envs.testing import random_states, untrained_potential
+from tests.helpers import random_states, untrained_potential
 from tests.surrogate.test_model import untrained_residual
 
 NAMES = ("finger", "trunk", "press_finger")

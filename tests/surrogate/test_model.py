@@ -23,7 +23,7 @@ from softgym_envs.surrogate.potential import kernels
 from softgym_envs.surrogate.potential.model import Model
 from softgym_envs.surrogate.pretrained import pretrained_folder, pretrained_model
 from softgym_envs.surrogate.weight_files import load_model
-from softgym_envs.testing import random_states, untrained_potential
+from tests.helpers import random_states, untrained_potential
 
 CABLES = (1, 2)
 

@@ -25,7 +25,7 @@ from softgym_envs.mechanics.skins import box_skin, tube_skin
 from softgym_envs.mechanics.solvers.complementarity import solve_complementarity
 from softgym_envs.mechanics.solvers.dynamics import Dynamics
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.testing import box_mesh
+from tests.helpers import box_mesh
 from tests.verification.rows import CheckedRow as Row
 from tests.verification.rows import as_results
 

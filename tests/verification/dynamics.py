@@ -24,7 +24,7 @@ from softgym_envs.mechanics.elements.rigid import box_inertia
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.dynamics import SCHEMES, Dynamics
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.testing import box_mesh
+from tests.helpers import box_mesh
 from tests.verification.robot_dynamics import (
     hanging,
     quasi_static,

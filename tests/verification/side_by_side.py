@@ -34,7 +34,7 @@ from softgym_envs.mechanics.materials import MATERIALS, lame_parameters
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.quantities import unchecked
-from softgym_envs.testing import box_mesh
+from tests.helpers import box_mesh
 from tests.verification.bodies import clamped_beam, halved, linear_response, solid, straight, traction
 from tests.verification.statics import COOK
 

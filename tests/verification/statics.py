@@ -19,7 +19,7 @@ from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.materials import MATERIALS
 from softgym_envs.mechanics.solids import SOLIDS
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.testing import box_mesh
+from tests.helpers import box_mesh
 from tests.verification.bodies import clamped_beam, halved, linear_response, solid, sphere_octant, straight, traction
 from tests.verification.rows import MeshRow as Row
 from tests.verification.rows import as_results, with_orders

@@ -18,7 +18,7 @@ from softgym_envs.mechanics.elements.rigid import box_inertia
 from softgym_envs.mechanics.skins import box_skin, tube_skin
 from softgym_envs.mechanics.solvers.dynamics import Dynamics
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.testing import box_mesh
+from tests.helpers import box_mesh
 from tests.verification import contact as cases
 
 

@@ -154,7 +154,7 @@ def export(
     from softgym_envs.extensions.deployment.cad import export_body
     from softgym_envs.extensions.deployment.mjcf import export_mjcf
     from softgym_envs.extensions.deployment.moulds import export_moulds
-    from softgym_envs.viewer.gltf import write_glb
+    from softgym_envs.extensions.recordings.gltf import write_glb
 
     if not files and moulds is None:
         raise ConfigError("nothing to write: pass a file ending with .step, .stl, .glb or .xml, or --moulds FOLDER")

@@ -22,7 +22,7 @@ from softgym_envs.mechanics.solvers import block_cholesky
 from softgym_envs.mechanics.solvers.dynamics import Dynamics
 from softgym_envs.mechanics.solvers.schemes import ImplicitEuler
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.testing import dense_tangent
+from tests.helpers import dense_tangent
 
 H = 0.01
 ORIGINS = slice(0, None, 4)  # rows of the origins of frames

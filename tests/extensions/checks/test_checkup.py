@@ -9,7 +9,7 @@ from softgym_envs import DesignSpace, DesignVariable
 from softgym_envs.extensions.checks.checkup import check_robot, wall_layers
 from softgym_envs.mechanics import MechanicalModel, Plane
 from softgym_envs.robots import Actuator, Robot
-from softgym_envs.testing import box_mesh
+from tests.helpers import box_mesh
 
 
 class Beam(Robot):

@@ -9,7 +9,7 @@ from softgym_envs import DesignSpace, DesignVariable, make_robot
 from softgym_envs.extensions.deployment.mjcf import chain_of, export_mjcf
 from softgym_envs.mechanics import MechanicalModel, Statics
 from softgym_envs.robots import Actuator, Robot
-from softgym_envs.testing import box_mesh
+from tests.helpers import box_mesh
 
 mujoco = pytest.importorskip("mujoco")
 

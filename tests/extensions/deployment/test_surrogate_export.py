@@ -21,7 +21,7 @@ from softgym_envs.surrogate.features import Features
 from softgym_envs.surrogate.model import SurrogateModel
 from softgym_envs.surrogate.potential.model import Model
 from softgym_envs.surrogate.pretrained import pretrained_model
-from softgym_envs.testing import random_states
+from tests.helpers import random_states
 
 CC = shutil.which("cc") or shutil.which("gcc")
 needs_compiler = pytest.mark.skipif(CC is None, reason="no C compiler")

@@ -34,7 +34,7 @@ from softgym_envs.surrogate.features import learned_variables
 from softgym_envs.surrogate.potential.model import Model
 from softgym_envs.surrogate.pretrained import pretrained_folder, pretrained_model, shipped_robots
 from softgym_envs.surrogate.weight_files import load_model, save_model
-from softgym_envs.testing import random_states
+from tests.helpers import random_states
 
 CALIBRATION = {
     "forces": 0.7,

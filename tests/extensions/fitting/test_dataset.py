@@ -32,7 +32,7 @@ from softgym_envs.extensions.fitting.data.sampling import (
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots import stiff_flop
 from softgym_envs.surrogate.features import learned_variables
-from softgym_envs.testing import live_processes, wait_until
+from tests.helpers import live_processes, wait_until
 
 PLAN = SamplingPlan(groups=4, states=3, sequence="halton", seed=5)
 

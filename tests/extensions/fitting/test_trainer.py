@@ -16,7 +16,7 @@ from softgym_envs.extensions.networks.perceptron import perceptron
 from softgym_envs.surrogate.potential.model import Model
 from softgym_envs.surrogate.potential.torch import PotentialNet
 from softgym_envs.surrogate.pretrained import pretrained_model
-from softgym_envs.testing import random_states
+from tests.helpers import random_states
 
 
 @pytest.mark.parametrize("schedule", ["cycle", "plateau"])

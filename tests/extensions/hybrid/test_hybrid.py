@@ -17,7 +17,7 @@ from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.backends.surrogate import SurrogateBackend, SurrogateBatch
 from softgym_envs.errors import ConvergenceError, DataError, WeightsError
 from softgym_envs.extensions.hybrid.backend import HybridBackend
-from softgym_envs.testing import train_small_surrogate
+from tests.helpers import train_small_surrogate
 
 LIMIT = 8e-3  # largest displacement in the training of `weights` [m]
 

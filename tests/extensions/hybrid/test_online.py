@@ -15,7 +15,7 @@ from softgym_envs.extensions.hybrid.online import StateStore, check_ensemble, fi
 from softgym_envs.surrogate.potential.model import Model
 from softgym_envs.surrogate.pretrained import pretrained_model
 from softgym_envs.surrogate.weight_files import load_model, save_model
-from softgym_envs.testing import sample_states
+from tests.helpers import sample_states
 
 LIMIT = 8e-3  # largest displacement in the training of `weights` [m]
 

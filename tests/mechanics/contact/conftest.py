@@ -7,7 +7,7 @@ import pytest
 
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.skins import box_skin
-from softgym_envs.testing import box_mesh
+from tests.helpers import box_mesh
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from softgym_envs.mechanics.solvers.dynamics import Dynamics
 from softgym_envs.mechanics.solvers.prediction import Bend
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.quantities import unchecked
-from softgym_envs.testing import box_mesh, contact_errors
+from tests.helpers import box_mesh, contact_errors
 from tests.verification.contact import block_on_incline
 
 GRAVITY = 9.81

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from softgym_envs.mechanics.contact.self_contact import SelfContact, SelfContactMemory, load_ipctk
 from softgym_envs.mechanics.elements.tetrahedra import boundary_triangles
-from softgym_envs.testing import box_mesh
+from tests.helpers import box_mesh
 
 DISTANCE, STIFFNESS = 5e-4, 1e6
 GAP = 2e-4

@@ -14,7 +14,7 @@ from softgym_envs.mechanics.elements.rigid import box_inertia
 from softgym_envs.mechanics.elements.tetrahedra import boundary_triangles
 from softgym_envs.mechanics.skins import box_skin
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.testing import box_mesh, contact_errors
+from tests.helpers import box_mesh, contact_errors
 
 
 def mesh_box(half, cells, centre=(0.0, 0.0, 0.0), **options):

@@ -101,6 +101,19 @@ class PostgresStorage(SharedStorage):
         ConfigError: if the database cannot be opened.
     """
 
+    form = "postgresql://user@host:port/database"
+
+    @classmethod
+    def takes(cls, address: str) -> bool:
+        from sqlalchemy.engine import make_url
+        from sqlalchemy.exc import ArgumentError
+
+        try:
+            url = make_url(address)
+        except (ArgumentError, ValueError):
+            return False
+        return url.get_backend_name() == "postgresql" and bool(url.database)
+
     def __init__(
         self, address: str, study: str, *, grace: float = 60.0, patience: float = 600.0, wait: bool = False
     ) -> None:

@@ -8,12 +8,12 @@ import pytest
 
 from softgym_envs import DesignSpace, DesignVariable
 from softgym_envs.errors import ConfigError
+from softgym_envs.extensions.recordings.paraview import ParaviewWriter, _volume
 from softgym_envs.mechanics import MechanicalModel
 from softgym_envs.robots import Actuator, Robot
-from softgym_envs.testing import box_mesh
 from softgym_envs.viewer import scene
-from softgym_envs.viewer.paraview import ParaviewWriter, _volume
 from softgym_envs.viewer.recording import watch_rollout
+from tests.helpers import box_mesh
 
 pyvista = pytest.importorskip("pyvista")
 

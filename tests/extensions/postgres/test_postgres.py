@@ -18,13 +18,13 @@ from softgym_envs.codesign.folder import StudyFolder
 from softgym_envs.codesign.records import Account, Job, TrialResult
 from softgym_envs.codesign.scheduling import worker
 from softgym_envs.codesign.scheduling.jobs import missing_jobs, run_pending
-from softgym_envs.codesign.scheduling.postgres import HEARTBEAT, PostgresStorage
 from softgym_envs.codesign.scheduling.queue import TrialQueue
 from softgym_envs.codesign.study import run_study
 from softgym_envs.errors import ConfigError, DataError, SoftGymError
-from softgym_envs.testing import wait_until
+from softgym_envs.extensions.postgres.storage import HEARTBEAT, PostgresStorage
 from tests.codesign.kills import Sweep, faults
-from tests.codesign.postgres_server import find_programs, temporary_server
+from tests.extensions.postgres.postgres_server import find_programs, temporary_server
+from tests.helpers import wait_until
 
 GRACE = 2.0
 

@@ -5,8 +5,8 @@ from importlib.util import find_spec
 import pytest
 
 from softgym_envs.agents.config import EnvironmentConfig
-from softgym_envs.agents.offline import record_episodes
 from softgym_envs.errors import MissingLibrary
+from softgym_envs.extensions.recordings.minari_dataset import record_episodes
 
 FINGER = EnvironmentConfig(id="SoftGym/FingerReach-v0", max_episode_steps=3)
 

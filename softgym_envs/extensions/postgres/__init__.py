@@ -1,0 +1,1 @@
+"""Studies that many machines share: their storage in a PostgreSQL database."""
