@@ -12,6 +12,7 @@ import numpy as np
 
 from softgym_envs.agents.baselines import BASELINES, Agent, make_baseline
 from softgym_envs.agents.config import EnvironmentConfig
+from softgym_envs.agents.learners import LEARNERS
 from softgym_envs.agents.policy import POLICY_FILE, Policy, shipped_policies
 from softgym_envs.agents.residual import BatchQP
 from softgym_envs.errors import ConfigError, DataError, unknown_name
@@ -269,6 +270,11 @@ def check_agent(agent: str | Path) -> None:
     names = [*BASELINES, *shipped_policies()]
     if name in names or name.endswith(".safetensors") or (Path(name) / "policy.safetensors").is_file():
         return
+    if name in LEARNERS:
+        raise ConfigError(
+            f"'{name}' is a learner, not an agent; agents are {', '.join(BASELINES)}, the folder or file of a policy "
+            f"('softgym train' makes one), and policies that ship, such as {names[-1]}"
+        )
     raise ConfigError(unknown_name("agent", name, names, other=POLICY_FILE))
 
 

@@ -238,6 +238,8 @@ STRENGTH = "configs/design/finger_strength.yaml"
         (["deploy", "finger", "x.bin"], ["'x.bin' must end with .h or .onnx"]),
         (["deploy", "finger", "x.h", "--members", "99"], ["members = 99", "1 to 5"]),
         (["deploy-policy", "finger_reech", "x.h"], ["unknown policy 'finger_reech'; did you mean 'finger_reach'?"]),
+        (["evaluate", "--agent", "sac"], ["'sac' is a learner, not an agent; agents are qp, ", "file of a policy"]),
+        (["rollout", "SoftGym/FingerReach-v0", "--agent", "ppo"], ["'ppo' is a learner, not an agent"]),
         (["configs", "--copy", "."], ["'.' exists; choose a new folder"]),
         (["--verison"], ["No such option '--verison'. Did you mean '--version'?"]),
     ],

@@ -59,13 +59,16 @@ def environment_of_agents(
         weights: folder of surrogate weights.
 
     Raises:
-        ConfigError: if the command names several environments, or none.
+        ConfigError: for an unknown agent, or if the command names several environments or none.
     """
     from softgym_envs.agents.baselines import BASELINES
     from softgym_envs.agents.config import EnvironmentConfig, TrainConfig
+    from softgym_envs.agents.evaluation import check_agent
     from softgym_envs.agents.policy import Policy
     from softgym_envs.config import check_config, load_config
 
+    for agent in agents:
+        check_agent(agent)
     policies = [Policy(agent) for agent in agents if agent not in BASELINES]
     data: dict[str, Any] = policies[0].environment.model_dump() if policies else {}
     given = {"ENVIRONMENT": id, "--config": config, "--robot": robot}
@@ -161,7 +164,7 @@ def rollout(
     --agent says which environment it is.
     """
     import softgym_envs  # noqa: F401 - registers the IDs
-    from softgym_envs.agents.evaluation import check_agent, make_agent
+    from softgym_envs.agents.evaluation import make_agent
     from softgym_envs.surrogate.domain import distrust_text
     from softgym_envs.viewer.moment import WRITERS, Watcher
     from softgym_envs.viewer.recording import Filmed, recorder_of, watch_rollout
@@ -177,7 +180,6 @@ def rollout(
 
         check_video(video)  # before the work begins
     body = options.design_of(design)
-    check_agent(agent)
     config = environment_of_agents("rollout", (agent,), backend, id=environment, **chosen)
     act = make_agent(agent, seed)
     drawn = {"render_mode": "rgb_array"} if video is not None else {}

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints as EmbeddedPoints
     from softgym_envs.mechanics.constraints.point import Point as Point
     from softgym_envs.mechanics.constraints.servo import Servo as Servo
+    from softgym_envs.mechanics.constraints.slide import Slide as Slide
     from softgym_envs.mechanics.contact.obstacles import Cylinder as Cylinder
     from softgym_envs.mechanics.contact.obstacles import MeshObstacle as MeshObstacle
     from softgym_envs.mechanics.contact.obstacles import Plane as Plane
@@ -34,6 +35,7 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "constraints.embedding": ["EmbeddedPoints"],
         "constraints.point": ["Point"],
         "constraints.servo": ["Servo"],
+        "constraints.slide": ["Slide"],
         "contact.obstacles": ["Cylinder", "MeshObstacle", "Plane", "RoundedPrism", "Sphere"],
         "elements.beams": ["Section"],
         "io": ["read_mesh"],

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from softgym_envs.extensions.grasping.robots.slide import Slide
-from softgym_envs.mechanics import constraints
+from softgym_envs.mechanics import ModelBuilder, Statics, constraints
 from softgym_envs.mechanics.constraints.averaging import averaged_points
 from softgym_envs.mechanics.constraints.bond import Bond
 from softgym_envs.mechanics.constraints.cable import Cable
@@ -22,6 +21,7 @@ from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.constraints.pose import Pose
 from softgym_envs.mechanics.constraints.servo import Servo
+from softgym_envs.mechanics.constraints.slide import Slide
 from softgym_envs.mechanics.elements.beams import Beam, Section
 from softgym_envs.mechanics.elements.quadratic import add_midside_nodes, quadratic_triangles, split_triangles
 from softgym_envs.mechanics.frames import frame_rows
@@ -105,7 +105,7 @@ def make_servo(nodes, tetrahedra):
 
 
 def make_slide(nodes, tetrahedra):
-    return Slide("slide", 4, np.array([0.2, 1.0, -0.3]), nodes)
+    return Slide("slide", EmbeddedPoints(np.array([0.3, 0.3, 0.3]), nodes, tetrahedra), np.array([0.2, 1.0, -0.3]))
 
 
 def make_pose(nodes, tetrahedra):
@@ -172,7 +172,7 @@ def differences(function, x, dofs, h=1e-6):
 
 
 def test_every_constraint_class_is_tested():
-    assert {*CLASSES, "Slide"} == {name.split()[0] for name in FACTORIES}  # the slide is an extension's
+    assert set(CLASSES) == {name.split()[0] for name in FACTORIES}
 
 
 def test_shapes(constraint, moved):
@@ -225,6 +225,36 @@ def test_a_motion_of_the_whole_body_changes_only_what_is_held_in_space(constrain
         np.testing.assert_allclose(constraint.value(turned), constraint.value(moved), atol=1e-13)
     elif isinstance(constraint, Point):
         np.testing.assert_allclose(constraint.value(turned), turn @ constraint.value(moved) + shift, atol=1e-13)
+
+
+# -- slide ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_slide_pushes_a_rod_by_its_stiffness_along_and_across():
+    # Steel wire: E A / L along it; across it 3 E I / L^3, with shear.
+    length, radius, modulus = 0.2, 2e-3, 2e11
+    builder = ModelBuilder()
+    builder.add_rod([[0, 0, 0], [0, 0, length]], section=Section.circle(radius), elements=8, young_modulus=modulus)
+    model = builder.build()
+    section, rod = Section.circle(radius), model.rods[0]
+    end = rod.points(length, (0.0, 0.0), model.nodes)
+    model.add("a", Slide("along", end, [0, 0, 5.0]))
+    model.add("a", Slide("across", end, [1, 0, 0]))
+    effort = Statics(model).solve([-1e-8, 2e-8]).effort[:2]
+    shear = 0.5 * modulus / (1.0 + 0.3) * section.area * section.shear[0]
+    across = 1.0 / (length**3 / (3.0 * modulus * section.inertia[0]) + length / shear)
+    np.testing.assert_allclose(effort, [-1e-8 * modulus * section.area / length, 2e-8 * across], rtol=1e-4)
+
+
+@pytest.mark.parametrize("direction", [[0.0, 0.0, 0.0], [1.0, 0.0], [np.inf, 0.0, 0.0]])
+def test_a_slide_needs_a_direction(mesh, direction):
+    with pytest.raises(ValueError, match="direction of slide 'push' must be three numbers"):
+        Slide("push", EmbeddedPoints(np.full((1, 3), 0.5), *mesh), direction)
+
+
+def test_a_slide_moves_one_point(mesh):
+    with pytest.raises(ValueError, match="slide 'push' needs exactly one embedded point, got 2"):
+        Slide("push", EmbeddedPoints(np.full((2, 3), 0.5), *mesh), [1.0, 0.0, 0.0])
 
 
 # -- cable ----------------------------------------------------------------------------------------------------------

@@ -18,11 +18,11 @@ from softgym_envs.extensions.grasping.grasps import KINDS, GraspObject
 from softgym_envs.extensions.grasping.robots.carried_objects import CARRIED, ROUNDING, Shape
 from softgym_envs.extensions.grasping.robots.contact_aided_finger import ContactAidedFinger
 from softgym_envs.extensions.grasping.robots.lifting import Lifting
-from softgym_envs.extensions.grasping.robots.slide import Slide
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.constraints.servo import Servo
+from softgym_envs.mechanics.constraints.slide import Slide
 from softgym_envs.mechanics.contact.obstacles import Obstacle, Plane
 from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.model import MechanicalModel
@@ -201,7 +201,7 @@ class ContactAidedGripper(Robot):
         for actuator, (servo, turn) in zip(self.actuators, servos, strict=False):
             axis = turn @ np.array([0.0, 0.0, -1.0])
             model.add("a", Servo(actuator.name, servo, axis, model.nodes))
-        model.add("a", Slide("lift", table, np.array([0.0, 0.0, -1.0]), model.nodes))
+        model.add("a", Slide("lift", EmbeddedPoints.in_frame(table, np.zeros(3), model.nodes), [0.0, 0.0, -1.0]))
         above_table = EmbeddedPoints.from_weights(np.array([[frame, table]]), np.array([[1.0, -1.0]]), model.nodes)
         model.add("e", Point("box", above_table))
         # The table acts on this skin; for the fingers, the obstacle of `own_obstacles` stands for it.
