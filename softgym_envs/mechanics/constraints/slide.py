@@ -31,7 +31,9 @@ class Slide(Constraint):
         along = np.asarray(direction, dtype=float)
         length = float(np.linalg.norm(along)) if along.shape == (3,) else 0.0
         if not 0.0 < length < np.inf:
-            raise ValueError(f"the direction of slide '{name}' must be three numbers of some length, got {direction}")
+            raise ValueError(
+                f"the direction of slide '{name}' must be three numbers of some length, got {along.tolist()}"
+            )
         self.name = name
         ids, weights = embedding.node_ids[0], embedding.weights[0]
         self.dofs = (3 * ids[:, None] + np.arange(3)).ravel()
