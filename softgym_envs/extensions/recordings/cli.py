@@ -34,14 +34,12 @@ def record(
     NAME is the name of the dataset, such as softgym/finger-reach/qp-v0. ENVIRONMENT as for rollout.
     """
     import softgym_envs  # noqa: F401 - registers the IDs
-    from softgym_envs.agents.evaluation import check_agent
     from softgym_envs.extensions.recordings.minari_dataset import record_episodes
 
     if episodes < 1:
         raise ConfigError(f"--episodes {episodes} must be at least 1")
     if not 1 <= len(names) <= 2:
         raise ConfigError(f"record takes [ENVIRONMENT] NAME, got {' '.join(names) or 'nothing'}")
-    check_agent(agent)
     id, name = names if len(names) == 2 else (None, names[0])
     config = environment_of_agents("record", (agent,), backend, id=id, **chosen)
     body = options.design_of(design) or None
