@@ -8,7 +8,6 @@ LEARNERS = Registry(
         "sac": "softgym_envs.agents.learners.sac:SACLearner",
         "ppo": "softgym_envs.agents.learners.ppo:PPOLearner",
         "analytic": "softgym_envs.agents.learners.analytic:AnalyticLearner",
-        "cloning": "softgym_envs.agents.learners.cloning:CloningLearner",
     },
     base="softgym_envs.agents.learners.base:Learner",
     group="softgym_envs.learners",

@@ -84,9 +84,6 @@ ENVIRONMENTS: dict[str, EnvironmentRow] = {
     "SoftGym/DiamondTrack-v0": environment_row("diamond", "track", 100, robot_options={"unilateral": False}),
     "SoftGym/CableTrunkReach-v0": environment_row("cable_trunk", "reach", 50),
     "SoftGym/CableTrunkTrack-v0": environment_row("cable_trunk", "track", 100),
-    "SoftGym/FingerPress-v0": environment_row("press_finger", "track", 100),
-    "SoftGym/GripperPinch-v0": environment_row("two_finger_gripper", "track", 100),
-    "SoftGym/GripperManipulate-v0": environment_row("three_finger_gripper", "track", 100),
 }
 """All environments of a robot with a task, by ID; `register_environment` and installed packages add to them."""
 

@@ -13,13 +13,13 @@ from safetensors import safe_open
 from softgym_envs.agents import training
 from softgym_envs.agents.config import EnvironmentConfig, TrainConfig
 from softgym_envs.agents.evaluation import evaluate, sample_goals
-from softgym_envs.agents.learners.cloning import CloningConfig, CloningLearner
 from softgym_envs.agents.learners.sac import SACLearner
 from softgym_envs.agents.policy import Policy
 from softgym_envs.agents.training import train
 from softgym_envs.config import load_config, shipped_configs
 from softgym_envs.envs.parallel import cpu_seconds
 from softgym_envs.errors import ConfigError, DataError, WeightsError
+from softgym_envs.extensions.learners.cloning import CloningConfig, CloningLearner
 from softgym_envs.storage import read_json, write_signed
 from tests.agents.interruption import interrupted_at
 

@@ -15,7 +15,6 @@ TASKS = Registry(
     {
         "reach": "softgym_envs.envs.tasks.reach:Reach",
         "track": "softgym_envs.envs.tasks.track:Track",
-        "carry": "softgym_envs.envs.tasks.carry:Carry",
     },
     base="softgym_envs.envs.tasks.base:Task",
     group="softgym_envs.tasks",

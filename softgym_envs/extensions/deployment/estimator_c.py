@@ -12,12 +12,12 @@ from softgym_envs.backends.surrogate import TOLERANCE
 from softgym_envs.extensions.deployment.c_loads import loaded_text
 from softgym_envs.extensions.deployment.c_text import check_identifier, comment, functions, names_of
 from softgym_envs.extensions.deployment.common import exportable
+from softgym_envs.extensions.fitting.row_errors import KNOTS
 from softgym_envs.extensions.sensing.estimator import IMPROBABLE
 from softgym_envs.extensions.sensing.learned import PLACES, STEP, LearnedEstimator
 from softgym_envs.extensions.sensing.loads import TouchGrid, cell_nodes
 from softgym_envs.extensions.sensing.readings import LARGEST_RESIDUAL, MAX_GROWTH
 from softgym_envs.storage import atomic_write
-from softgym_envs.surrogate.row_errors import KNOTS
 from softgym_envs.version import __version__
 
 _HERE = Path(__file__).parent

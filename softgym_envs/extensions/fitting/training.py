@@ -21,6 +21,7 @@ from softgym_envs.errors import ConfigError
 from softgym_envs.extensions.fitting.data.dataset import generate_dataset, lost
 from softgym_envs.extensions.fitting.data.sampling import SamplingPlan
 from softgym_envs.extensions.fitting.data.states import full_compliance, stable_rows, training_states, with_images
+from softgym_envs.extensions.fitting.row_errors import RowErrors
 from softgym_envs.extensions.fitting.trainer import Trainer
 from softgym_envs.extras import require
 from softgym_envs.mechanics.condensation import effort_unit
@@ -33,7 +34,6 @@ from softgym_envs.surrogate.correction import fit_correction
 from softgym_envs.surrogate.domain import DISTRUST_REASONS
 from softgym_envs.surrogate.features import Features
 from softgym_envs.surrogate.model import SurrogateModel, definite
-from softgym_envs.surrogate.row_errors import RowErrors
 from softgym_envs.surrogate.weight_files import load_model, new_card, save_model
 from softgym_envs.wording import counted
 

@@ -2,8 +2,8 @@
 
 The QP knows the condensed model of the plant's present state, hidden effector and touches included. The policy, a gated
 recurrent unit, gets the observations of an episode one after the other and learns what the QP would do (Chen et al.,
-Learning by cheating, 2019). As in `softgym_envs.agents.learners.cloning`, answers are collected in the states that the
-policy itself visits (DAgger); an update follows whole episodes of them through time.
+Learning by cheating, 2019). As in `softgym_envs.extensions.learners.cloning`, answers are collected in the states that
+the policy itself visits (DAgger); an update follows whole episodes of them through time.
 """
 
 from __future__ import annotations

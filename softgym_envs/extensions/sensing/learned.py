@@ -18,6 +18,7 @@ from scipy.stats import chi2
 
 from softgym_envs.backends.surrogate import TOLERANCE
 from softgym_envs.errors import ConvergenceError, WeightsError
+from softgym_envs.extensions.fitting.row_errors import RowErrors
 from softgym_envs.extensions.sensing.estimator import IMPROBABLE
 from softgym_envs.extensions.sensing.loads import Touch, cell_nodes
 from softgym_envs.extensions.sensing.places import Mixture, Moments, Places
@@ -37,7 +38,6 @@ from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.domain import OUTSIDE, UNEXPLAINED
 from softgym_envs.surrogate.model import Context, SurrogateModel
 from softgym_envs.surrogate.pretrained import pretrained_model
-from softgym_envs.surrogate.row_errors import RowErrors
 
 PLACES = 4
 """Places along each edge of a cell: the response is nearly quadratic in a cell, which four describe."""

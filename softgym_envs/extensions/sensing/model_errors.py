@@ -9,9 +9,9 @@ import numpy as np
 from softgym_envs.backends.backend import Backend, PointForce
 from softgym_envs.backends.surrogate import SurrogateBackend
 from softgym_envs.errors import ConvergenceError
+from softgym_envs.extensions.fitting.row_errors import RowErrors
 from softgym_envs.extensions.sensing.loads import TouchGrid
 from softgym_envs.mechanics.surfaces import CrossingWarning
-from softgym_envs.surrogate.row_errors import RowErrors
 
 
 def measured_errors(

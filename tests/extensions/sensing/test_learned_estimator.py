@@ -10,13 +10,13 @@ import pytest
 from softgym_envs import make_robot
 from softgym_envs.backends.backend import PointForce
 from softgym_envs.backends.surrogate import SurrogateBackend
+from softgym_envs.extensions.fitting.row_errors import KNOTS, RowErrors
 from softgym_envs.extensions.sensing import Noise, Payload, Readings, Touch, finger_grid
 from softgym_envs.extensions.sensing.learned import LearnedEstimator
 from softgym_envs.extensions.sensing.model_errors import measured_errors
 from softgym_envs.extensions.sensing.readings import LARGEST_RESIDUAL
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.surrogate.domain import OUTSIDE, UNEXPLAINED
-from softgym_envs.surrogate.row_errors import KNOTS, RowErrors
 
 GRID = finger_grid()
 POINT = np.array([0.001, 0.0, -0.093])

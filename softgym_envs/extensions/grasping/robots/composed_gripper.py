@@ -9,13 +9,13 @@ import numpy as np
 from softgym_envs.designs import DesignVariable
 from softgym_envs.extensions.grasping.held_fingers import CABLES, HeldFingers, IdleCables
 from softgym_envs.extensions.grasping.robots.contact_finger import ContactFinger
+from softgym_envs.extensions.grasping.robots.grippers import TURNED, Placements, ThreeFingerGripper
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.pose import Pose
 from softgym_envs.mechanics.elements.parts import Port
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.skins import curve_skin
 from softgym_envs.robots.geometry.finger_shape import THICKNESS
-from softgym_envs.robots.grippers import TURNED, Placements, ThreeFingerGripper
 
 ARRANGEMENTS = {"1+1": (1, 1), "1+2": (1, 2), "2+2": (2, 2), "2+3": (2, 3)}
 """Numbers of fingers that push along +y and along -y."""

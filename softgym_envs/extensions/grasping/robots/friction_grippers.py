@@ -1,8 +1,8 @@
 """Grippers whose fingers hold a rigid object by friction, and can drop it.
 
-They have the fingers and the objects of `softgym_envs.robots.grippers`. There, ball joints tie the object to the
-fingers, as published. Here the object has a mass, stands on a stand, and is held by nothing but contact. No published
-scene has this, so that the first body warns of how much the linear elements of the default mesh lock.
+They have the fingers and the objects of `softgym_envs.extensions.grasping.robots.grippers`. There, ball joints tie the
+object to the fingers, as published. Here the object has a mass, stands on a stand, and is held by nothing but contact.
+No published scene has this, so that the first body warns of how much the linear elements of the default mesh lock.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.designs import DesignVariable
+from softgym_envs.extensions.grasping.robots.grippers import STRAIGHT, TURNED, FingerRobot, ThreeFingerGripper
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
@@ -21,7 +22,6 @@ from softgym_envs.mechanics.elements.rigid import box_inertia
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.skins import box_skin
 from softgym_envs.robots.capabilities import Learning
-from softgym_envs.robots.grippers import STRAIGHT, TURNED, FingerRobot, ThreeFingerGripper
 
 ROUNDING = 2e-3
 """Radius of the edges of the objects and of the stand [m]."""

@@ -24,7 +24,7 @@ from softgym_envs.envs.vector_env import SoftRobotVectorEnv
 
 
 class CloningConfig(GradientConfig):
-    """Hyperparameters of the imitation of the inverse QP (`softgym_envs.agents.learners.cloning`)."""
+    """Hyperparameters of the imitation of the inverse QP (`softgym_envs.extensions.learners.cloning`)."""
 
     batch_size: int = Field(default=256, gt=0)
     gradient_steps: int = Field(default=8, gt=0, description="per step of all environments together")

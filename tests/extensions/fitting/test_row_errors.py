@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 
-from softgym_envs.surrogate.row_errors import KNOTS, RowErrors
+from softgym_envs.extensions.fitting.row_errors import KNOTS, RowErrors
 
 
 def test_mean_and_deviation_are_found():
