@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from softgym_envs.agents.config import EnvironmentConfig
 
 AGENT_HELP = (
-    "qp, qp_static, qp_model, qp_pi, qp_estimated, force, close, gait, steer, random, or a policy (a file, the folder of "
-    "a training or the name of a shipped one)."
+    "qp, qp_static, qp_model, qp_pi, qp_estimated, force, close, gait, steer, random, or a policy (a file, the folder "
+    "of a training or the name of a shipped one)."
 )
 
 
