@@ -9,7 +9,7 @@ import operator
 import shutil
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, astuple, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -19,7 +19,7 @@ from pydantic import Field, model_validator
 from softgym_envs.config import BesideConfig, Config
 from softgym_envs.errors import ConfigError
 from softgym_envs.extensions.fitting.data.dataset import generate_dataset, lost
-from softgym_envs.extensions.fitting.data.sampling import SamplingPlan
+from softgym_envs.extensions.fitting.data.sampling import HasParts, Lost, SamplingPlan
 from softgym_envs.extensions.fitting.data.states import full_compliance, stable_rows, training_states, with_images
 from softgym_envs.extensions.fitting.row_errors import RowErrors
 from softgym_envs.extensions.fitting.trainer import Trainer
@@ -66,7 +66,8 @@ class SplitConfig(Config):
 class DataConfig(Config):
     """Three separate datasets. The validation set chooses the best step of a training; the test set is used once.
 
-    ``more`` is a second set of training states, for example bodies at the vertices of the design box.
+    ``more`` is a second set of training states, for example bodies at the vertices of the design box. ``within`` names
+    a robot on whose paths the states of the learned one lie, which is a part of it (`SamplingPlan`).
     Seeds default to 0, 1 and 2. An interrupted run keeps finished shards of ``groups_per_shard`` bodies; choose small
     ones where a body takes long.
     """
@@ -82,6 +83,7 @@ class DataConfig(Config):
     alike: tuple[str, ...] = ()
     boundary: float = Field(default=0.0, ge=0.0, le=1.0)
     one_mesh: bool = False
+    within: str = ""
     groups_per_shard: int = Field(default=10, gt=0)
 
     @model_validator(mode="before")
@@ -294,13 +296,13 @@ def account(robot: Robot, card: Mapping[str, Any]) -> list[str]:
     """
     lines = []
     for split, states in card["states"].items():
-        bodies, commands = card.get("lost", {}).get(split, (0, 0))
-        unstable = card["unstable_states_left_out"][split]
-        kinds: tuple[tuple[int, str, str], ...] = (
-            (bodies, "body", "that cannot be built or held"),
-            (commands, "command", "without an equilibrium"),
+        left = Lost(*card.get("lost", {}).get(split, ()))
+        kinds = (
+            (left.bodies, "body", "that cannot be built or held"),
+            (left.commands, "command", "without an equilibrium"),
+            (left.states, "state", "outside the ranges of the actuators"),
+            (card["unstable_states_left_out"][split], "state", "too unstable to learn"),
         )
-        kinds = (*kinds, (unstable, "state", "too unstable to learn"))
         parts = [f"{counted(n, name)} {why}" for n, name, why in kinds if n]
         lines.append(f"{split}: {counted(states, 'state')}; lost: {', '.join(parts) or 'nothing'}")
     found = card.get("trusted")
@@ -399,6 +401,18 @@ def check_learnable(robot: Robot, config: FitConfig) -> None:
         )
 
 
+def check_within(whole: Robot, robot: Robot) -> None:
+    """Refuse paths of a robot of which the learned one is no part.
+
+    Raises:
+        ConfigError: if it is not.
+    """
+    if not isinstance(whole, HasParts):
+        raise ConfigError(f"data.within = '{whole.name}': it has no parts to learn")
+    if (part := whole.one_part().name) != robot.name:
+        raise ConfigError(f"data.within = '{whole.name}': its part is '{part}', not '{robot.name}'")
+
+
 def generate_datasets(config: FitConfig, data_folder: str | Path, *, progress: bool = True) -> Datasets:
     """Return the datasets of a surrogate; whatever is missing is generated.
 
@@ -407,7 +421,10 @@ def generate_datasets(config: FitConfig, data_folder: str | Path, *, progress: b
         ``pretraining/train`` and ``pretraining/validation``; with a correction also ``correction/coarser``,
         ``correction/own`` and ``correction/finer``.
     """
-    check_learnable(make_robot(config.robot, **config.robot_options), config)
+    robot = make_robot(config.robot, **config.robot_options)
+    check_learnable(robot, config)
+    if config.data.within:
+        check_within(make_robot(config.data.within, **config.robot_options), robot)
     run = RunFolder(data_folder, FitConfig, "datasets")
     if not run.begun:  # an existing file is kept until the data are accepted
         run.begin(config)
@@ -486,7 +503,7 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
         **({"errors": row_errors(model, data["validation"]).to_card()} if model.sensors else {}),
         "correction": _correction(config, data, features),
     }
-    card["lost"] = {name: lost(data_folder / name) for name in data}
+    card["lost"] = {name: astuple(lost(data_folder / name)) for name in data}
     card["trusted"] = trusted_part(Model(robot, trained.tensors, card), data["test"])
     save_model(Model(robot, trained.tensors, card), folder)
     history = {f"{p}_{k}": np.array([row[k] for row in rows]) for p, rows in trained.histories.items() for k in rows[0]}

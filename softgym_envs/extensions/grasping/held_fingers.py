@@ -18,8 +18,11 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from softgym_envs.errors import ConvergenceError
 from softgym_envs.extensions.grasping.robots.contact_finger import ContactFinger
 from softgym_envs.mechanics.elements.block import Massless, add_entries, lower_pairs
+from softgym_envs.mechanics.solvers.equilibrium import Equilibrium
+from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.surrogate.model import Context, SurrogateModel
 
 POSE, CABLES = 6, 2
@@ -99,6 +102,60 @@ class LearnedFingers:
     def errors(self, y: np.ndarray) -> np.ndarray:
         efforts = self._model.member_efforts(Context.shared(self._context, len(y)), y)
         return INFLATION / np.sqrt(len(efforts)) * (efforts - efforts.mean(axis=0))
+
+
+class SolvedFingers:
+    """Finite elements of the fingers of one body; each follows a path of its own.
+
+    Args:
+        robot: the finger.
+        design: of the body; other variables are left out.
+        tolerance: of the equilibria [m].
+
+    Attributes:
+        found: the equilibria at which the derivatives were asked for, in this order, by finger.
+        patience: how many more coordinates may have no equilibrium; then `evaluate` raises ConvergenceError, since each
+            costs a second.
+
+    Raises:
+        InfeasibleDesign: if the finger cannot be meshed.
+    """
+
+    learned = False
+
+    def __init__(self, robot: ContactFinger, design: Mapping[str, float], *, tolerance: float = 1e-10) -> None:
+        own = robot.design_space.complete({name: design[name] for name in robot.design_space.names})
+        self.origin, self._model = robot.object_frame(own), robot.build(own)
+        self._tolerance, self.patience = tolerance, np.inf
+        self._solvers: list[Statics] = []
+        self.found: list[list[Equilibrium]] = []
+
+    def evaluate(self, y: np.ndarray) -> Fingers | None:
+        while len(self._solvers) < len(y):
+            statics = Statics(self._model, tolerance=self._tolerance, max_iterations=12, max_halvings=3)
+            statics.unilateral = np.zeros(SIZE, dtype=bool)  # cables stay where they are, even if they push
+            self._solvers.append(statics)
+            self.found.append([])
+        before = [statics.snapshot for statics in self._solvers]
+        try:
+            states = [statics.solve(row) for statics, row in zip(self._solvers, y, strict=True)]
+        except ConvergenceError:
+            for statics, snapshot in zip(self._solvers, before, strict=True):
+                statics.snapshot = snapshot
+            self.patience -= 1
+            if self.patience < 0:
+                raise
+            return None
+        for path, state in zip(self.found, states, strict=True):
+            path.append(state)
+        stiffness = [np.linalg.inv(state.condensed.W.aa) for state in states]
+        return Fingers(np.stack([state.condensed.lambda_.a for state in states]), np.stack(stiffness))
+
+    def knows(self, y: np.ndarray) -> bool:
+        return True
+
+    def errors(self, y: np.ndarray) -> np.ndarray:
+        return np.zeros((0, *y.shape))
 
 
 class HeldFingers(Massless):

@@ -10,13 +10,12 @@ from softgym_envs.extensions.fitting.training import FitConfig, account, generat
 from softgym_envs.robots.soft_finger import SoftFinger
 
 SPLIT = {"groups": 2, "states": 2}
+DATA = {name: SPLIT for name in ("train", "validation", "test")}
 PLANE = {"kind": "plane", "point": [0.0, 0.0, -0.2], "normal": [0.0, 0.0, 1.0]}
 
 
 def config(robot, **options):
-    return FitConfig.model_validate(
-        {"robot": robot, "data": {name: SPLIT for name in ("train", "validation", "test")}, **options}
-    )
+    return FitConfig.model_validate({"robot": robot, "data": DATA, **options})
 
 
 class StretchingFinger(SoftFinger):
@@ -36,6 +35,11 @@ class StretchingFinger(SoftFinger):
             config("finger", robot_options={"obstacles": [PLANE]}),
             "'finger' touches obstacles, which a surrogate",
         ),
+        (
+            config("finger", data={**DATA, "within": "composed_gripper"}),
+            r"data.within = 'composed_gripper': its part is 'contact_finger', not 'finger'",
+        ),
+        (config("finger", data={**DATA, "within": "trunk"}), "data.within = 'trunk': it has no parts to learn"),
         (config("modular_arm"), r"would drive .* beyond max_effort: leave it out .* or set alone = false"),
     ],
 )
@@ -48,7 +52,7 @@ def test_what_no_backend_would_take_is_refused_before_any_data(tmp_path, wanted,
 CARD = {
     "states": {"train": 40, "test": 18},
     "unstable_states_left_out": {"train": 3, "test": 0},
-    "lost": {"train": (1, 53), "test": (0, 0)},
+    "lost": {"train": (1, 53, 7), "test": (0, 0, 0)},
     "test": {"states": 18},
     "trusted": {
         "share": 0.12,
@@ -64,7 +68,7 @@ def test_what_a_fit_says():
     lines = account(make_robot("finger"), CARD)
     assert lines[0] == (
         "train: 40 states; lost: 1 body that cannot be built or held, 53 commands without an equilibrium, "
-        "3 states too unstable to learn"
+        "7 states outside the ranges of the actuators, 3 states too unstable to learn"
     )
     assert lines[1] == "test: 18 states; lost: nothing"
     assert lines[2].startswith("'cable_1' needs up to 3e+03 N, 150 times its effort_scale")

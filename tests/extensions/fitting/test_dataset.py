@@ -22,6 +22,7 @@ from softgym_envs.extensions.fitting.data import dataset, sampling
 from softgym_envs.extensions.fitting.data.dataset import COLUMNS, generate_dataset, load_dataset
 from softgym_envs.extensions.fitting.data.sampling import (
     SEQUENCES,
+    Lost,
     SamplingPlan,
     may_be_joined,
     path_order,
@@ -276,8 +277,8 @@ def test_margin_lets_slack_cables_push_but_not_beyond_their_commands():
     results = {}
     for margin in (0.0, 0.05, 1.0):
         plan = SamplingPlan(1, 14, seed=2, margin=margin, vary=())
-        data, failed = sample_group(robot, plan, 0)
-        assert failed == 0
+        data, lost = sample_group(robot, plan, 0)
+        assert lost == Lost()
         fractions = plan.unit_points(2, 0, 14, 14, 1)
         order = path_order(fractions, -robot.lower / span)
         results[margin] = data, robot.lower + fractions[order] * span
@@ -310,7 +311,7 @@ def test_infeasible_designs_are_left_out(monkeypatch):
         raise InfeasibleDesign("cannot be built")
 
     monkeypatch.setattr(robot, "build", refuse)
-    assert sample_group(robot, PLAN, 0) == (None, PLAN.states)
+    assert sample_group(robot, PLAN, 0) == (None, Lost(bodies=1, commands=PLAN.states))
 
 
 def test_bodies_with_meshes_of_their_own_are_left_out_on_request():
@@ -366,7 +367,10 @@ def test_manifest_and_card(made):
     assert manifest["plan"]["sequence"] == "halton"
     card = (folder / "README.md").read_text()
     assert card.startswith("# States of robot `finger`\n\n16 states of 4 bodies, by `softgym dataset`")
-    assert "0 bodies without a mesh or without an equilibrium at rest, and 0 commands without an equilibrium" in card
+    assert (
+        "Left out: 0 bodies without a mesh or without an equilibrium at rest, 0 commands without an equilibrium, and "
+        "0 states outside the ranges of the actuators." in card
+    )
     column = data["effector"][:, 1]
     assert f"| effector: tip y | 16 | {column.min():.6g} | {column.max():.6g} |" in card
     for label in ("design: joint_height", "displacement: cable_2", "effort: cable_1", "compliance: upper triangle"):
@@ -537,7 +541,7 @@ def test_infeasible_designs_are_counted(tmp_path, monkeypatch, trunk):
     original = dataset.sample_group
 
     def sample(robot, plan, group):
-        return original(robot, plan, group) if group == 1 else (None, plan.states)
+        return original(robot, plan, group) if group == 1 else (None, Lost(1, plan.states))
 
     monkeypatch.setattr(dataset, "sample_group", sample)
     # The second shard has no feasible design.
@@ -546,7 +550,7 @@ def test_infeasible_designs_are_counted(tmp_path, monkeypatch, trunk):
     np.testing.assert_array_equal(data["effector"], trunk[1]["effector"][4:8])
     card = (tmp_path / "one" / "README.md").read_text()
     assert "4 states of 1 body," in card and "3 bodies without a mesh" in card
-    monkeypatch.setattr(dataset, "sample_group", lambda robot, plan, group: (None, plan.states))
+    monkeypatch.setattr(dataset, "sample_group", lambda robot, plan, group: (None, Lost(1, plan.states)))
     with pytest.raises(DataError, match="no design of dataset '.*none' is feasible"):
         generate_dataset(tmp_path / "none", "trunk", PLAN, groups_per_shard=2, progress=False)
 

@@ -13,8 +13,16 @@ from softgym_envs.backends.surrogate import SurrogateBackend
 from softgym_envs.control import InverseQP
 from softgym_envs.errors import WeightsError
 from softgym_envs.extensions.deployment.surrogate_c import export_c
+from softgym_envs.extensions.fitting.data.dataset import generate_dataset, lost
+from softgym_envs.extensions.fitting.data.sampling import SamplingPlan
 from softgym_envs.extensions.grasping.backends.fingers import FingersBackend, FingersHybridBackend
-from softgym_envs.extensions.grasping.held_fingers import Fingers, HeldFingers, LearnedFinger, LearnedFingers
+from softgym_envs.extensions.grasping.held_fingers import (
+    Fingers,
+    HeldFingers,
+    LearnedFinger,
+    LearnedFingers,
+    SolvedFingers,
+)
 from softgym_envs.extensions.grasping.robots.composed_gripper import ARRANGEMENTS
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
@@ -27,30 +35,6 @@ from softgym_envs.surrogate.pretrained import pretrained_model
 MESH_SIZE = 12e-3
 COMMAND = 1e-3 * np.array([8.0, 6.0, 2.0, 7.0, 9.0, 0.0, 4.0, 1.0, -1.0, 2.0])
 ID = "SoftGym/ComposedGripperManipulate-v0"
-
-
-class FEMFingers:
-    """Finite elements of one finger; the solver of each follows its own path."""
-
-    learned = False
-
-    def __init__(self, robot, design):
-        own = {name: design[name] for name in robot.design_space.names}
-        self.model, self.origin = robot.build(own), robot.object_frame(robot.design_space.complete(own))
-        self.solvers = []
-
-    def evaluate(self, y):
-        while len(self.solvers) < len(y):
-            self.solvers.append(Statics(self.model, tolerance=1e-13))
-            self.solvers[-1].unilateral = np.zeros(2 + 6, dtype=bool)
-        states = [solver.solve(row) for solver, row in zip(self.solvers, y, strict=False)]
-        return Fingers(
-            np.stack([state.effort[:8] for state in states]),
-            np.stack([np.linalg.inv(state.condensed.W.aa) for state in states]),
-        )
-
-    def knows(self, y):
-        return True
 
 
 class Formula:
@@ -175,8 +159,10 @@ def test_fingers_around_an_object_agree_with_the_gripper(fingers):
     """Pose, tensions, slack cables and W of a composed finite-element finger, to 1e-7 of the whole gripper."""
     robot = make_robot("composed_gripper", mesh_size=MESH_SIZE)
     design = robot.design_space.complete({"fingers": fingers, "angle": 0.25, "length": 0.041, "young_modulus": 4e6})
-    part = robot.one_finger()
-    parts = robot.of_parts({"finger": lambda design, gravity: {"energy": FEMFingers(part, design)}}).build(design)
+    part = robot.one_part()
+    parts = robot.of_parts(
+        {"finger": lambda design, gravity: {"energy": SolvedFingers(part, design, tolerance=1e-13)}}
+    ).build(design)
     model = robot.build(design)
     expected, found = Statics(model, tolerance=1e-12).solve(COMMAND), Statics(parts, tolerance=1e-11).solve(COMMAND)
     frames = model.frames.rows[0], parts.frames.rows[0]
@@ -222,12 +208,64 @@ def test_missing_fingers_have_cables_that_move_nothing():
     np.testing.assert_allclose(state.condensed.W.aa[4:, 4:], 1e-3 * np.eye(6), atol=1e-15)
 
 
+# -- states from which a finger is learned --------------------------------------------------------------------------
+
+
+def test_states_of_fingers_on_paths_of_grippers(tmp_path):
+    """They are equilibria of one finger, apart from each other; an interrupted dataset is the same when it is read."""
+    robot = make_robot("composed_gripper", mesh_size=MESH_SIZE)
+    part, span = robot.one_part(), robot.one_part().upper - robot.one_part().lower
+    plan = SamplingPlan(2, 2, "random", seed=3, boundary=0.5, within="composed_gripper")
+    folder, options = tmp_path / "data", {"mesh_size": MESH_SIZE}
+    data = generate_dataset(folder, "contact_finger", plan, robot_options=options, groups_per_shard=1, progress=False)
+    assert data["rest"].sum() == 2 and data["rest"][0]
+    assert (data["displacement"] >= part.lower - 1e-8).all() and (data["displacement"] <= part.upper + 1e-8).all()
+    first = np.flatnonzero(data["rest"])[1]
+    statics = Statics(part.build(dict(zip(part.design_space.names, data["design"][0], strict=True))))
+    statics.unilateral = np.zeros(8, dtype=bool)
+    steps = np.abs(np.diff(data["displacement"][:first], axis=0)) / span
+    assert (steps.max(axis=1) > 0.0099).all()
+    for row in (1, first // 2, first - 1):
+        state = statics.solve(data["displacement"][row])
+        np.testing.assert_allclose(state.condensed.lambda_.a, data["effort"][row], atol=1e-4)
+        np.testing.assert_allclose(state.condensed.delta.e, data["effector"][row], atol=1e-7)
+    again = generate_dataset(folder, "contact_finger", plan, robot_options=options, groups_per_shard=1, progress=False)
+    np.testing.assert_array_equal(again["effort"], data["effort"])
+    assert lost(folder).bodies == 0
+
+
+def test_paths_of_fingers_lead_to_the_equilibrium_of_the_gripper():
+    robot, command = make_robot("composed_gripper", mesh_size=MESH_SIZE), np.tile([0.003, 0.001, 0.004, 0.002, 0.0], 2)
+    design = robot.design_space.complete({"fingers": "1+2", "spacing": 0.05})
+    paths, given_up = robot.part_states(design, command[None])
+    found = np.array([path[-1].condensed.delta.a[:2] for path in paths]).ravel()
+    expected = Statics(robot.build(design)).solve(command)
+    assert given_up == 0 and expected.slack[:6].any()
+    np.testing.assert_allclose(found, expected.delta[:6], atol=2e-4)
+
+
+def test_a_command_that_a_finger_cannot_follow_is_lost_after_few_tries(monkeypatch):
+    robot = make_robot("composed_gripper", mesh_size=MESH_SIZE)
+    solve, tries = SolvedFingers.evaluate, []
+
+    def evaluate(self, y):
+        beyond = y[:, 0].max() > 0.005
+        tries.append(beyond)
+        return solve(self, y + 1.0 if beyond else y)
+
+    monkeypatch.setattr(SolvedFingers, "evaluate", evaluate)
+    commands = np.array([np.full(10, 0.004), np.full(10, 0.006), np.full(10, 0.003)])
+    paths, given_up = robot.part_states(robot.design_space.baseline, commands)
+    assert given_up == 1 and sum(tries) == 3 and len(paths) == 3
+    assert paths[0][-1].condensed.delta.a[0] == pytest.approx(0.003, abs=2e-4)
+
+
 # -- learned fingers ------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
 def model():
-    return pretrained_model(make_robot("composed_gripper").one_finger())
+    return pretrained_model(make_robot("composed_gripper").one_part())
 
 
 @pytest.mark.parametrize("fingers", list(ARRANGEMENTS))

@@ -81,9 +81,9 @@ def test_groups_share_a_body_under_several_touches():
     assert radii[0] == radii[1] == radii[2] != radii[3] == radii[4] == radii[5]
     assert len(set(forces)) == 6
     assert plan.designs(robot, 4, 1)[0] == designs[4]
-    group, failed = sample_group(robot, plan, 0)
-    assert group["effector"].shape == (2 - failed, 8)
-    assert group["compliance"].shape == (2 - failed, 45)
+    group, lost = sample_group(robot, plan, 0)
+    assert group["effector"].shape == (2 - lost.commands, 8)
+    assert group["compliance"].shape == (2 - lost.commands, 45)
 
 
 def test_the_estimator_reaches_goals_in_the_environment():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, astuple
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from softgym_envs.errors import DataError
 from softgym_envs.executors import parallel_map
-from softgym_envs.extensions.fitting.data.sampling import SamplingPlan, sample_group
+from softgym_envs.extensions.fitting.data.sampling import Lost, SamplingPlan, sample_group
 from softgym_envs.robots.base import Robot
 from softgym_envs.robots.registry import make_robot
 from softgym_envs.storage import atomic_write, read_json, read_npz, write_json
@@ -60,15 +60,15 @@ def _make_shard(robot: str, options: dict, plan: SamplingPlan, first: int, last:
         key = (robot, json.dumps(options))
         if _robot is None or _robot[0] != key:
             _robot = (key, make_robot(robot, **options))
-        parts, failed = [], 0
+        parts, lost = [], Lost()
         for group in range(first, last):
-            part, lost = sample_group(_robot[1], plan, group)
-            failed += lost
+            part, left_out = sample_group(_robot[1], plan, group)
+            lost += left_out
             if part is not None:
                 parts.append(part)
     shard = {name: np.concatenate([part[name] for part in parts]) if parts else np.zeros(0) for name in COLUMNS}
     with atomic_write(path) as stream:
-        np.savez_compressed(stream, allow_pickle=False, failed=failed, infeasible=last - first - len(parts), **shard)
+        np.savez_compressed(stream, allow_pickle=False, lost=astuple(lost), **shard)
 
 
 #: How long a run waits for the lock of its folder [s].
@@ -139,7 +139,8 @@ def generate_dataset(
         },
     }
     manifest = json.loads(json.dumps(manifest))  # in the form in which it is read back: lists instead of tuples
-    plan.designs(body, 0, 1)  # refuse an impossible plan before anything is written
+    # Refuse an impossible plan before anything is written.
+    plan.designs(make_robot(plan.within, **options) if plan.within else body, 0, 1)
     path = folder / "manifest.json"
     card = folder / "README.md"
     if path.exists():
@@ -181,7 +182,8 @@ def _make_missing(folder: Path, manifest: dict[str, Any], plan: SamplingPlan, wo
                 print(f"{error}; renamed to '{aside.name}', generating it again")
         first = number * manifest["groups_per_shard"]
         missing.append((first, min(first + manifest["groups_per_shard"], plan.groups), str(shard)))
-    arguments = [(manifest["robot"], manifest["robot_options"], plan, *shard_range) for shard_range in missing]
+    sampled = plan.within or manifest["robot"]
+    arguments = [(sampled, manifest["robot_options"], plan, *shard_range) for shard_range in missing]
     with tqdm(
         total=len(shards), initial=len(shards) - len(missing), unit="shard", desc=folder.name, disable=not progress
     ) as bar:
@@ -191,13 +193,14 @@ def _make_missing(folder: Path, manifest: dict[str, Any], plan: SamplingPlan, wo
 
 def _write_card(path: Path, manifest: dict[str, Any], data: dict[str, np.ndarray]) -> None:
     """Write the card that describes the dataset to people."""
-    infeasible, failed = lost(path.parent)
+    left = lost(path.parent)
     lines = [
         f"# States of robot `{manifest['robot']}`",
         "",
         f"{counted(len(data['rest']), 'state')} of {counted(int(data['rest'].sum()), 'body')}, by `softgym dataset` "
-        f"(softgym-envs {__version__}). Left out: {counted(infeasible, 'body')} without a mesh or without an "
-        f"equilibrium at rest, and {counted(failed, 'command')} without an equilibrium.",
+        f"(softgym-envs {__version__}). Left out: {counted(left.bodies, 'body')} without a mesh or without an "
+        f"equilibrium at rest, {counted(left.commands, 'command')} without an equilibrium, and "
+        f"{counted(left.states, 'state')} outside the ranges of the actuators.",
         "",
         f"Robot options: `{json.dumps(manifest['robot_options'])}`. Plan: `{json.dumps(manifest['plan'])}`.",
         "",
@@ -214,18 +217,17 @@ def _write_card(path: Path, manifest: dict[str, Any], data: dict[str, np.ndarray
         stream.write("\n".join(lines))
 
 
-def lost(folder: str | Path) -> tuple[int, int]:
-    """Return how many bodies and commands of a finished dataset were left out, since they have no equilibrium.
+def lost(folder: str | Path) -> Lost:
+    """Return what was left out of a finished dataset.
 
     Raises:
         DataError: if the manifest is missing or damaged.
     """
-    bodies = commands = 0
+    found = Lost()
     for shard in _shards(Path(folder), _read_manifest(Path(folder) / "manifest.json")):
         with np.load(shard, allow_pickle=False) as content:
-            commands += int(content["failed"]) if "failed" in content else 0
-            bodies += int(content["infeasible"]) if "infeasible" in content else 0
-    return bodies, commands
+            found += Lost(*map(int, content["lost"]))
+    return found
 
 
 def _shards(folder: Path, manifest: dict[str, Any]) -> list[Path]:

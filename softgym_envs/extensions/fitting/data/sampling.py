@@ -12,6 +12,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -27,6 +28,12 @@ from softgym_envs.surrogate.features import learned_variables
 SEQUENCES = ("halton", "sobol", "latin", "random", "vertices")
 """Kinds of points: scrambled Halton and Sobol sequences, a Latin hypercube, independent draws, and for the designs the
 vertices of their box with independent draws of the commands."""
+
+SLIGHT = 1e-9
+"""By how much solved coordinates may leave their ranges."""
+
+APART = 0.01
+"""By how much of its range at least one coordinate of a part must change between two states on its path."""
 
 SOFTEST = 0.01
 """Smallest mean stiffness between two joined equilibria, relative to that at the first (see `may_be_joined`)."""
@@ -54,6 +61,8 @@ class SamplingPlan:
             more than the states under one more load.
         one_mesh: leave out bodies to which the mesh of the baseline does not move well: their own meshes have errors of
             their own, which no smooth function of the design describes.
+        within: robot with parts of which the learned one is a part. Designs and commands are that robot's, and states
+            those of the part on its paths (`HasParts`): a fraction of its own range, at a fraction of the time.
     """
 
     groups: int
@@ -69,6 +78,7 @@ class SamplingPlan:
     share: float = 1.0
     loads: int = 1
     one_mesh: bool = False
+    within: str = ""
 
     def __post_init__(self) -> None:
         if self.sequence not in SEQUENCES:
@@ -260,27 +270,73 @@ def may_be_joined(first: Equilibrium, second: Equilibrium) -> bool:
     return bool(work >= SOFTEST * (half @ half) - 1e-12)
 
 
-def sample_group(robot: Robot, plan: SamplingPlan, group: int) -> tuple[dict[str, np.ndarray] | None, int]:
+@runtime_checkable
+class HasParts(Protocol):
+    """A robot of equal parts, one of which can be learned."""
+
+    def one_part(self) -> Robot:
+        """Return the part as a robot, whose actuators are its coordinates."""
+
+    def part_states(self, design: Design, commands: np.ndarray) -> tuple[list[list[Equilibrium]], int]:
+        """Return states of each part on a path of commands, the first at rest, and the number of commands lost."""
+
+
+@dataclass(frozen=True)
+class Lost:
+    """What was left out of a dataset.
+
+    Attributes:
+        bodies: that cannot be built, or have no equilibrium at rest.
+        commands: without an equilibrium.
+        states: of parts that are outside the ranges of their actuators.
+    """
+
+    bodies: int = 0
+    commands: int = 0
+    states: int = 0
+
+    def __add__(self, other: Lost) -> Lost:
+        return Lost(self.bodies + other.bodies, self.commands + other.commands, self.states + other.states)
+
+
+def sample_group(robot: Robot, plan: SamplingPlan, group: int) -> tuple[dict[str, np.ndarray] | None, Lost]:
     """Solve all states of one design, each starting from the previous one.
+
+    Args:
+        robot: the robot that is learned, or with `SamplingPlan.within` that of which it is a part.
+        plan: what to sample.
+        group: number of the design.
 
     Returns:
         Arrays with one row per solved state: ``design`` (all variables), ``displacement``, ``effort``, ``effector``,
         ``compliance`` (upper triangle of W, row by row) and ``rest`` (1 for the state at rest), or None for a design
-        that is infeasible, has a mesh that the plan leaves out, or has no equilibrium at rest; and the number of
-        commands without an equilibrium, which are left out. Sensor rows are the last columns of ``effector``.
+        that is infeasible, has a mesh that the plan leaves out, or has no equilibrium at rest; and what was left out.
+        Sensor rows are the last columns of ``effector``.
     """
-    space = robot.design_space
-    count = len(robot.actuators)
-    zero = np.zeros(count)
     try:
         design = plan.designs(robot, group, 1)[0]
         if plan.one_mesh and isinstance(robot, GmshRobot) and robot.body(design).origin != "morphed":
-            return None, plan.states
-        model = robot.build(design)
-        statics = Statics(model)
-        rest = statics.solve(zero)
+            return None, Lost(1, plan.states)
+        learned, rows, lost = (_part_rows if plan.within else _rows)(robot, plan, group, design)
     except (InfeasibleDesign, ConvergenceError):
-        return None, plan.states
+        return None, Lost(1, plan.states)
+    upper = np.triu_indices(len(rows[0].condensed.effort))
+    own = [design[name] for name in learned.design_space.names]
+    return {
+        "design": np.tile(own, (len(rows), 1)),
+        "displacement": np.stack([r.condensed.delta.a for r in rows]),
+        "effort": np.stack([r.condensed.lambda_.a for r in rows]),
+        "effector": np.stack([np.concatenate([r.condensed.delta.e, _sensors(r)]) for r in rows]),
+        "compliance": np.stack([r.condensed.compliance[upper] for r in rows]),
+        "rest": np.arange(len(rows)) == 0,
+    }, lost
+
+
+def _rows(robot: Robot, plan: SamplingPlan, group: int, design: Design) -> tuple[Robot, list[Equilibrium], Lost]:
+    """Return the states of a design, the first at rest."""
+    count = len(robot.actuators)
+    statics = Statics(robot.build(design))
+    rest = statics.solve(np.zeros(count))
     rows: list[Equilibrium] = [rest]
     span = robot.upper - robot.lower
     commands = plan.commands(robot, group)
@@ -303,15 +359,29 @@ def sample_group(robot: Robot, plan: SamplingPlan, group: int) -> tuple[dict[str
             finally:
                 statics.unilateral = kept
         rows.append(equilibrium)
-    upper = np.triu_indices(len(rest.condensed.effort))
-    return {
-        "design": np.tile([design[name] for name in space.names], (len(rows), 1)),
-        "displacement": np.stack([r.condensed.delta.a for r in rows]),
-        "effort": np.stack([r.condensed.lambda_.a for r in rows]),
-        "effector": np.stack([np.concatenate([r.condensed.delta.e, _sensors(r)]) for r in rows]),
-        "compliance": np.stack([r.condensed.compliance[upper] for r in rows]),
-        "rest": np.arange(len(rows)) == 0,
-    }, failed
+    return robot, rows, Lost(0, failed)
+
+
+def _part_rows(robot: Robot, plan: SamplingPlan, group: int, design: Design) -> tuple[Robot, list[Equilibrium], Lost]:
+    """Return states of the parts of a design, the first at rest, that differ by `APART` along each path."""
+    assert isinstance(robot, HasParts)
+    part, span = robot.one_part(), robot.upper - robot.lower
+    commands = plan.commands(robot, group)
+    order = path_order((commands - robot.lower) / span, -robot.lower / span)
+    paths, failed = robot.part_states(design, commands[order])
+    rows, outside = [paths[0][0]], 0
+    for path in paths:
+        last = path[0].condensed.delta.a
+        for state in path[1:]:
+            y = state.condensed.delta.a
+            if (np.abs(y - last) < APART * (part.upper - part.lower)).all():
+                continue
+            last = y
+            if ((y >= part.lower - SLIGHT) & (y <= part.upper + SLIGHT)).all():
+                rows.append(state)
+            else:
+                outside += 1
+    return part, rows, Lost(0, failed, outside)
 
 
 def _sensors(state: Equilibrium) -> np.ndarray:

@@ -44,7 +44,7 @@ class FingersBackend(FEMBackend):
             raise WeightsError(
                 f"robot '{robot.name}': learned fingers touch nothing, got obstacles or self_contact; use backend='fem'"
             )
-        model = pretrained_model(robot.one_finger(), weights)
+        model = pretrained_model(robot.one_part(), weights)
         self._learned = robot.of_parts({"finger": LearnedFinger(model)})
         super().__init__(robot, design)
 

@@ -6,8 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from softgym_envs.designs import DesignVariable
-from softgym_envs.extensions.grasping.held_fingers import CABLES, HeldFingers, IdleCables
+from softgym_envs.designs import Design, DesignVariable
+from softgym_envs.errors import ConvergenceError
+from softgym_envs.extensions.grasping.held_fingers import CABLES, HeldFingers, IdleCables, SolvedFingers
 from softgym_envs.extensions.grasping.robots.contact_finger import ContactFinger
 from softgym_envs.extensions.grasping.robots.grippers import TURNED, Placements, ThreeFingerGripper
 from softgym_envs.mechanics.builder import ModelBuilder
@@ -15,6 +16,8 @@ from softgym_envs.mechanics.constraints.pose import Pose
 from softgym_envs.mechanics.elements.parts import Port
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.skins import curve_skin
+from softgym_envs.mechanics.solvers.equilibrium import Equilibrium
+from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.geometry.finger_shape import THICKNESS
 
 ARRANGEMENTS = {"1+1": (1, 1), "1+2": (1, 2), "2+2": (2, 2), "2+3": (2, 3)}
@@ -26,6 +29,10 @@ EDGE = 5.0e-3
 IDLE_STIFFNESS = 1000.0
 """Of the spring that a cable pulls whose finger is missing [N/m]: its range takes 20 N, as in a finger."""
 
+
+PATH_STEP, PATH_TOLERANCE, PATH_PATIENCE = 8.0e-3, 1.0e-4, 2
+"""Of paths on which states of fingers lie: steps of the cables [m], how close to the equilibria they end [m], and how
+often in a step a finger may have no equilibrium until the command is given up."""
 
 DOWNWARDS = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
 """Axes of a finger as columns, the first one along it."""
@@ -86,9 +93,42 @@ class ComposedGripper(ThreeFingerGripper):
                 found.append((whole @ turn, tuple(whole @ shift + middle)))
         return tuple(found)
 
-    def one_finger(self) -> ContactFinger:
+    def one_part(self) -> ContactFinger:
         """Return the finger of which the gripper consists, as the robot that is learned."""
         return ContactFinger(**self._options)
+
+    def part_states(self, design: Design, commands: np.ndarray) -> tuple[list[list[Equilibrium]], int]:
+        """Return states of the fingers of a body on the way of the gripper from command to command.
+
+        They are finite elements, and the states those in which Newton's method of the gripper asks for their forces: on
+        the path of equilibria and beside it, where the gripper of learned fingers will ask, too.
+
+        Args:
+            design: of the gripper.
+            commands: shortenings of the cables [m], shape (n, 10), in the order of the path.
+
+        Returns:
+            The states of each finger from rest on, and the number of commands without an equilibrium.
+
+        Raises:
+            InfeasibleDesign: for a body that cannot exist.
+            ConvergenceError: if the body has no equilibrium at rest.
+        """
+        fingers = SolvedFingers(self.one_part(), design, tolerance=1e-9)
+        model = self.of_parts({"finger": lambda design, gravity: {"energy": fingers}}).build(design)
+        statics = Statics(model, tolerance=PATH_TOLERANCE, max_iterations=10, max_halvings=2)
+        start, lost = np.zeros(len(self.actuators)), 0
+        statics.solve(start)
+        for command in commands:
+            steps = int(np.ceil(np.abs(command - start).max() / PATH_STEP))
+            try:
+                for target in np.linspace(start, command, steps + 1)[1:]:
+                    fingers.patience = PATH_PATIENCE
+                    statics.solve(target)
+                    start = target
+            except ConvergenceError:
+                lost += 1
+        return fingers.found, lost
 
     def add_object(self, assembly: ModelBuilder, design: Mapping[str, float]) -> int:
         frame = super().add_object(assembly, design)

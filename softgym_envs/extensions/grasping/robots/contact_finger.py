@@ -46,12 +46,12 @@ class ContactFinger(FingerRobot):
     learning = Learning(stiffness_variable="young_modulus", convex=False)
     #: Name, smallest and largest value, and unit of the coordinates of the pose.
     pose_ranges = (
-        ("x", -0.009, 0.009, "m"),
-        ("y", -0.008, 0.012, "m"),
+        ("x", -0.011, 0.011, "m"),
+        ("y", -0.010, 0.012, "m"),
         ("z", -0.004, 0.026, "m"),
         ("rx", -0.36, 0.44, "1"),
-        ("ry", -0.36, 0.36, "1"),
-        ("rz", -0.26, 0.26, "1"),
+        ("ry", -0.68, 0.68, "1"),
+        ("rz", -0.44, 0.44, "1"),
     )
     #: The pose depends on the cables: in the three-finger gripper its mean is about the first number, plus these slopes
     #: [1/m] times the sum and the difference of the two shortenings, ...
