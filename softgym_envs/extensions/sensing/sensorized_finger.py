@@ -45,6 +45,18 @@ from softgym_envs.robots.soft_finger import FINGER_MESHES
 LENGTH = 40.0
 HEIGHT = 20.0
 
+LEARNED_BOX = {
+    "slope": (0.42, 0.66),
+    "outer_radius": (13.8e-3, 15.4e-3),
+    "joint_height": (5.0e-3, 7.0e-3),
+    "bellow_height": (7.0e-3, 10.0e-3),
+    "wall_thickness": (2.8e-3, 3.4e-3),
+    "cork_thickness": (2.6e-3, 4.0e-3),
+    "plateau_height": (2.5e-3, 3.5e-3),
+    "poisson_ratio": (0.30, 0.30 + 1e-10),  # a variable cannot have one value
+}
+"""Bodies that the shipped weights know: the mesh of the baseline moves to nearly all; Poisson's ratio is its own."""
+
 _LATERAL_POINT = (-THICKNESS / 2, HEIGHT / 2, -1.5 * LENGTH)
 
 
@@ -81,6 +93,8 @@ class SensorReadings:
 
 class SensorizedFinger(GmshRobot):
     """Cable-driven soft finger that senses the volumes of its cavities, or the pressures if they are sealed.
+
+    The design box ``"learned"`` is that of the shipped weights (`LEARNED_BOX`), a small part of the published one.
 
     The condensed model has the actuator (the cable), the effector (the tip point) and the sensors: one row of role
     ``s`` per cavity, whose delta is the change of its volume [m3] or its gauge pressure [Pa], from the base to the tip
@@ -135,6 +149,7 @@ class SensorizedFinger(GmshRobot):
         super().__init__(mesh=mesh, meshing=meshing, **options)
         self.reproduces_scene = self.tier in (self.meshes["published"], self.meshes["local"])
         self.cavities, self.touch = cavities, touch
+        self.design_boxes = {"learned": LEARNED_BOX | {"split": (0.75e-3, 1.5e-3)} if cavities == 4 else LEARNED_BOX}
         mm = 1e-3
         shape = [
             DesignVariable(

@@ -41,6 +41,18 @@ def test_sensors_and_touch_agree_with_finite_elements(robot):
         assert W.ea[1:] == pytest.approx(truth.ea[1:], rel=0.2)
 
 
+@pytest.mark.parametrize("cavities", [2, 4])
+def test_bodies_of_the_learned_box_are_trusted_and_others_are_not(cavities, rng):
+    for box, least, most in (("learned", 0.9, 1.0), ("published", 0.0, 0.1)):
+        body = make_robot("sensorized_finger", cavities=cavities, design_box=box)
+        backend = SurrogateBackend(body)
+        trusted = []
+        for _ in range(20):
+            backend.reset(body.design_space.sample(rng))
+            trusted.append(backend.step(COMMAND).trusted)
+        assert least <= np.mean(trusted) <= most
+
+
 def test_a_touch_ends_and_goes_on_from_a_snapshot(robot):
     backend = SurrogateBackend(robot)
     free = backend.step(COMMAND)
