@@ -111,13 +111,15 @@ def calibrate_trust(
     Bodies are drawn in strata, such as inside the design box and at its corners. The uncertainty is scaled until it
     covers 95 % of the errors under commands in each stratum. Then the limit of trust is lowered until a search finds
     no trusted state that is off by more than the goal tolerance. The result is written to the card of the weights.
-    Bodies of learned parts have one command each, and no search.
+    Bodies of learned parts have no search, and those of the Tetrapod one command each.
 
     With --test nothing is written: calibrated weights are judged as they are, on states of another --seed.
     """
     from dataclasses import asdict
 
     from softgym_envs.extensions.fitting.calibration import calibrate, tested
+    from softgym_envs.extensions.fitting.data.sampling import HasParts
+    from softgym_envs.extensions.fitting.within import calibrate_within
     from softgym_envs.surrogate.pretrained import pretrained_folder
 
     body = options.robot_of(robot, options_)
@@ -131,6 +133,15 @@ def calibrate_trust(
 
         found_of_parts = calibrate_parts(weights, body.learned_mesh(), bodies=bodies, seed=seed)
         click.echo(json.dumps(found_of_parts, indent=2))
+        return
+    if isinstance(body, HasParts):
+        if test:
+            raise click.UsageError(f"--test judges weights of whole robots; those of '{robot}' are of its parts")
+        with nullcontext() if folder is None else options.resumable():
+            found = calibrate_within(
+                weights, body, bodies=bodies, states=states, seed=seed, state_folder=folder, workers=workers
+            )
+        click.echo(json.dumps({name: asdict(row) for name, row in found.items()}, indent=2))
         return
     with nullcontext() if folder is None else options.resumable():
         found = (tested if test else calibrate)(

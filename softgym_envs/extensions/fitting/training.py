@@ -513,9 +513,14 @@ def fit(config: FitConfig, folder: str | Path, data_folder: str | Path, *, progr
     load_model(folder, robot)  # fail now if the written files cannot be read
     if config.trust is not None:
         from softgym_envs.extensions.fitting.calibration import calibrate
+        from softgym_envs.extensions.fitting.within import calibrate_within
 
-        options = config.trust.model_dump()
-        calibrate(folder, robot, **options, state_folder=data_folder / "judged", workers=config.workers)
+        options = config.trust.model_dump() | {"state_folder": data_folder / "judged", "workers": config.workers}
+        if config.data.within:
+            del options["adversarial_states"]
+            calibrate_within(folder, make_robot(config.data.within, **config.robot_options), **options)
+        else:
+            calibrate(folder, robot, **options)
     shutil.rmtree(folder / "parts", ignore_errors=True)
     return errors
 

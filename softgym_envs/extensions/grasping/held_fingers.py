@@ -29,10 +29,6 @@ POSE, CABLES = 6, 2
 SIZE = CABLES + POSE
 """Coordinates of a finger: its cables [m], then displacements [m] and sines [1] of the pose, in its own axes."""
 
-INFLATION = 2.5
-"""Of what the members of an ensemble differ by: then 95 % of the errors of an object that learned fingers hold are
-smaller, inside the design space (2.6 on 78 states of two to five fingers) as at its corners (2.2)."""
-
 
 class Fingers(NamedTuple):
     """Fingers at coordinates.
@@ -89,6 +85,9 @@ class LearnedFingers:
         self.origin = robot.object_frame(complete)
         self._model, self._context = model, model.context(complete.array[None])
         self._known = bool(self._context.arrays["known"].all())
+        domain, calibration = model.card.get("domain", {}), model.card.get("calibration", {})
+        # Of what the members differ by: such that it covers 95 % of the errors of objects that fingers hold.
+        self._inflation = calibration.get("inflation", domain.get("inflation", np.inf))
 
     def evaluate(self, y: np.ndarray) -> Fingers | None:
         context = Context.shared(self._context, len(y))
@@ -101,7 +100,7 @@ class LearnedFingers:
 
     def errors(self, y: np.ndarray) -> np.ndarray:
         efforts = self._model.member_efforts(Context.shared(self._context, len(y)), y)
-        return INFLATION / np.sqrt(len(efforts)) * (efforts - efforts.mean(axis=0))
+        return self._inflation / np.sqrt(len(efforts)) * (efforts - efforts.mean(axis=0))
 
 
 class SolvedFingers:
