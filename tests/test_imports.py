@@ -172,7 +172,7 @@ env = gymnasium.make("SoftGym/{identifier}")
 env.reset(seed=0), env.step(env.action_space.sample())
 print(*(name for name in sys.modules if name.startswith("softgym_envs.mechanics.")))
 """
-SURROGATE_NEEDS = "condensation compilation materials solvers solvers.complementarity solvers.reduction".split()
+SURROGATE_NEEDS = "condensation compilation materials solvers solvers.complementarity".split()
 """Modules of mechanics that a step on a surrogate may load: 1,000 of 16,000 lines, neither elements nor equilibria."""
 
 

@@ -1,6 +1,6 @@
 """Learned inertia: how slowly a body moves in the coordinates of its condensed model.
 
-`softgym_envs.mechanics.solvers.reduction` gives the mass ``M`` about an equilibrium in the constraint values of a body
+`softgym_envs.extensions.fitting.reduction` gives the mass ``M`` about an equilibrium in the constraint values of a body
 and its inner modes. The mass follows from the compliance ``W`` of a learned model and from the matrix of squared
 periods, ``P = K^-1/2 M K^-1/2`` with ``K = diag(W^-1, 1)`` and the roots of `half_stiffness`: its eigenvalues are
 ``1 / omega^2`` of the free body [s2]. They change far less from body to body than masses do, and they are all that is
@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.errors import WeightsError
-from softgym_envs.mechanics.solvers.reduction import root
 from softgym_envs.robots.base import Robot
 from softgym_envs.runs import provenance
 from softgym_envs.storage import atomic_write
@@ -86,6 +85,12 @@ def from_entries(entries: np.ndarray) -> np.ndarray:
 def typical_sizes(robot: Robot) -> np.ndarray:
     """Return the unit in which each constraint value is seen: ranges of actuators, the robot's size for effectors."""
     return np.concatenate([robot.upper - robot.lower, np.full(3 * len(robot.effectors), robot.size)])
+
+
+def root(matrix: np.ndarray, power: float = 0.5) -> np.ndarray:
+    """Return the symmetric power of symmetric positive definite matrices (..., n, n)."""
+    values, vectors = np.linalg.eigh(matrix)
+    return (vectors * values[..., None, :] ** power) @ np.swapaxes(vectors, -1, -2)
 
 
 def half_stiffness(W: np.ndarray, sizes: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ from scipy.linalg import block_diag, eigh
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 from softgym_envs.executors import parallel_map
 from softgym_envs.extensions.fitting.data.sampling import SamplingPlan, solve_path
-from softgym_envs.mechanics.solvers.reduction import reduce_motion
+from softgym_envs.extensions.fitting.reduction import reduce_motion
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.features import Features

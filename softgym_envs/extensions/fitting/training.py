@@ -18,6 +18,7 @@ from pydantic import Field, model_validator
 
 from softgym_envs.config import BesideConfig, Config
 from softgym_envs.errors import ConfigError
+from softgym_envs.extensions.fitting.correction import fit_correction
 from softgym_envs.extensions.fitting.data.dataset import generate_dataset, lost
 from softgym_envs.extensions.fitting.data.sampling import HasParts, Lost, SamplingPlan
 from softgym_envs.extensions.fitting.data.states import full_compliance, stable_rows, training_states, with_images
@@ -30,7 +31,6 @@ from softgym_envs.robots.base import Robot
 from softgym_envs.robots.registry import make_robot
 from softgym_envs.runs import RunFolder
 from softgym_envs.storage import atomic_write
-from softgym_envs.surrogate.correction import fit_correction
 from softgym_envs.surrogate.domain import DISTRUST_REASONS
 from softgym_envs.surrogate.features import Features
 from softgym_envs.surrogate.model import SurrogateModel, definite

@@ -7,8 +7,8 @@ import pytest
 from scipy.linalg import eigh, null_space
 from scipy.sparse import csc_matrix
 
+from softgym_envs.extensions.fitting.reduction import reduce_motion
 from softgym_envs.mechanics.constraints.point import Point
-from softgym_envs.mechanics.solvers.reduction import reduce_motion
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.soft_finger import SoftFinger
 from tests.verification import dynamics as cases

@@ -19,9 +19,11 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from softgym_envs.errors import ConvergenceError
+from softgym_envs.mechanics.assembly import MassAndDamping
+from softgym_envs.mechanics.solvers.schemes import StartingAcceleration
+from softgym_envs.surrogate.inertia import root
 
 if TYPE_CHECKING:
-    from softgym_envs.mechanics.assembly import MassAndDamping
     from softgym_envs.mechanics.solvers.statics import Statics
 
 DEPENDENT = 1e-10
@@ -45,12 +47,6 @@ class ReducedMotion:
     damping: np.ndarray
     stiffness: np.ndarray
     modes: np.ndarray
-
-
-def root(matrix: np.ndarray, power: float = 0.5) -> np.ndarray:
-    """Return the symmetric power of symmetric positive definite matrices (..., n, n)."""
-    values, vectors = np.linalg.eigh(matrix)
-    return (vectors * values[..., None, :] ** power) @ np.swapaxes(vectors, -1, -2)
 
 
 def reduce_motion(
@@ -102,8 +98,6 @@ def reduce_motion(
     mass, stiffness = 0.5 * (mass + mass.T), 0.5 * (stiffness + stiffness.T)
     damping = np.zeros_like(mass)
     if mass_damping or stiffness_damping:
-        from softgym_envs.mechanics.assembly import MassAndDamping
-
         damping = _damping(statics, modes, mass, MassAndDamping(mass_matrix, mass_damping, stiffness_damping))
     return ReducedMotion(mass, damping, stiffness, modes)
 
@@ -121,8 +115,6 @@ def _inner_modes(statics: Statics, modes: np.ndarray, mass_rows, units: np.ndarr
 
 def _damping(statics: Statics, modes: np.ndarray, mass: np.ndarray, body: MassAndDamping) -> np.ndarray:
     """Return the damping (k, k) of modes (N, k) with a reduced mass (k, k)."""
-    from softgym_envs.mechanics.solvers.schemes import StartingAcceleration
-
     model, x = statics.model, statics.x
 
     def power(mode: np.ndarray) -> float:
