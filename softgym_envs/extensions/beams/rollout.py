@@ -83,7 +83,7 @@ class Rollout:
             ValueError: for another shape, or neighbours of another body.
         """
         beams = self.dynamics.compiled_solver()
-        assert beams is not None
+        assert isinstance(beams, BeamMotion)
         targets = np.zeros_like(self.effort)
         anchors = None if self._tape.anchors is None else np.zeros_like(self._tape.anchors[0])
         start = np.zeros_like(self.x[0]), np.zeros_like(self.x[0]), anchors
@@ -122,7 +122,7 @@ class Rollout:
     ) -> np.ndarray:
         """Return derivatives by design variables (d,) from the adjoint of the steps and derivatives by the start."""
         beams = self.dynamics.compiled_solver()
-        assert beams is not None
+        assert isinstance(beams, BeamMotion)
         own, at_rest = self.dynamics.model.nodes, 1.0 if self._began_at_rest() else 0.0
         neighbours.check_like(beams.body)
         out = np.empty(len(neighbours.loads))
@@ -153,7 +153,7 @@ class Rollout:
         if not np.array_equal(tape.x[0], nodes) or tape.velocity[0].any():
             return False
         beams = dynamics.compiled_solver()
-        if touching is None or tape.anchors is None or beams is None or beams.body.contact is None:
+        if touching is None or tape.anchors is None or not isinstance(beams, BeamMotion) or beams.body.contact is None:
             return True
         return np.array_equal(
             tape.anchors[0], anchors_of(beams.body.contact, ContactMemory(touching.relaxed(nodes), None))
