@@ -12,7 +12,6 @@ from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 
 if TYPE_CHECKING:
     from softgym_envs.mechanics.elements.beams import Beam
-    from softgym_envs.mechanics.elements.parts import Port
 
 BRIDGE_SECTIONS = 9
 """Outlines along a bar between two frames."""
@@ -50,10 +49,10 @@ def tube_skin(beam: Beam, nodes: np.ndarray, outline: np.ndarray) -> Skin:
     ids = np.repeat(beam.chain, k)[:, None] + np.arange(4)
     points = EmbeddedPoints.from_weights(ids, np.column_stack([np.ones(len(local)), local]), nodes)
     # d_1 points along the beam: the outline is seen counter-clockwise from its far end.
-    return Skin(points, _swept_triangles(count, k))
+    return Skin(points, swept_triangles(count, k))
 
 
-def _swept_triangles(count: int, k: int) -> np.ndarray:
+def swept_triangles(count: int, k: int) -> np.ndarray:
     """Return the sides and flat ends of ``count`` outlines of ``k`` corners, counter-clockwise from the far end."""
     a = (k * np.arange(count - 1)[:, None] + np.arange(k)).ravel()
     b = (k * np.arange(count - 1)[:, None] + (np.arange(k) + 1) % k).ravel()
@@ -83,36 +82,7 @@ def bridge_skin(first: int, second: int, half_widths: Sequence[float], axes: np.
     columns = (near * ends, (1.0 - s) * x, (1.0 - s) * y, rise * ends, far * ends, s * x, s * y, fall * ends)
     weights = np.stack([np.broadcast_to(c, ends.shape).ravel() for c in columns], axis=1)
     ids = np.tile(np.concatenate([first + np.arange(4), second + np.arange(4)]), (len(weights), 1))
-    return Skin(EmbeddedPoints.from_weights(ids, weights, nodes), _swept_triangles(len(s), k), touches=False)
-
-
-def curve_skin(near: Port, far: Port, length: float, outline: np.ndarray, nodes: np.ndarray) -> Skin:
-    """Sweep an outline along the cubic curve between two ports that leaves each along its first axis, to be drawn.
-
-    Args:
-        near: where the curve begins.
-        far: where it ends.
-        length: of the part [m], by which the curve bulges.
-        outline: corners [m] along the second and third axes, counter-clockwise, shape (k, 2).
-        nodes: rest rows [m], shape (n, 3).
-    """
-    s = np.linspace(0.0, 1.0, BRIDGE_SECTIONS)
-    shares = ((1.0 - s) ** 2 * (1.0 + 2.0 * s), length * s * (1.0 - s) ** 2, 1.0 - s)
-    others = (s**2 * (3.0 - 2.0 * s), length * s**2 * (s - 1.0), s)
-    weights = []
-    for port, (stay, leave, share) in ((near, shares), (far, others)):
-        directors = nodes[port.frame + 1 : port.frame + 4]
-        axes = directors @ port.axes  # in the directors of the frame, as columns
-        arm = directors @ (port.middle - nodes[port.frame])
-        places = (
-            stay[:, None, None] * arm
-            + leave[:, None, None] * axes[:, 0]
-            + share[:, None, None] * (outline @ axes[:, 1:].T)
-        )
-        weights += [np.broadcast_to(stay[:, None, None], (*places.shape[:2], 1)), places]
-    ids = np.tile(np.concatenate([near.frame + np.arange(4), far.frame + np.arange(4)]), (len(s) * len(outline), 1))
-    points = EmbeddedPoints.from_weights(ids, np.concatenate(weights, axis=2).reshape(-1, 8), nodes)
-    return Skin(points, _swept_triangles(len(s), len(outline)), touches=False)
+    return Skin(EmbeddedPoints.from_weights(ids, weights, nodes), swept_triangles(len(s), k), touches=False)
 
 
 def box_skin(row: int, half_extents: Sequence[float], nodes: np.ndarray, *, divisions: int = 1) -> Skin:

@@ -23,7 +23,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from softgym_envs.mechanics.elements.parts import ROWS, Energies, Parts, Port
+from softgym_envs.extensions.beams.elements import ROWS, Energies, Parts, Port
 
 LARGEST_ROTATION = 0.98
 """Sine of the rotation between the ports at which the strains are no longer a measure of it."""

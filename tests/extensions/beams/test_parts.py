@@ -10,12 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from softgym_envs import make_robot
 from softgym_envs.errors import WeightsError
+from softgym_envs.extensions.beams.elements import PoseParts
 from softgym_envs.extensions.beams.parts.backends import PartsBackend
 from softgym_envs.extensions.beams.parts.energy import LegFunction
 from softgym_envs.extensions.beams.parts.leg import VARIABLES, LegScale
 from softgym_envs.extensions.beams.parts.weights import LearnedLeg
 from softgym_envs.extensions.fitting.parts.held_leg import HeldLeg
-from softgym_envs.mechanics.elements.parts import PoseParts
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.surrogate.domain import SOFT
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse import csc_matrix
 
-from softgym_envs.mechanics.elements.parts import PoseParts
+from softgym_envs.extensions.beams.elements import PoseParts
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.domain import OUTSIDE, SOFT, SPREAD

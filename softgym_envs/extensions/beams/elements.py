@@ -14,8 +14,10 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from softgym_envs.mechanics.compilation import njit
+from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.elements.beams import warp_lines
 from softgym_envs.mechanics.elements.block import ElementBlock, StrainRates, lower_pairs
+from softgym_envs.mechanics.skins import BRIDGE_SECTIONS, Skin, swept_triangles
 
 ROWS = 8
 """Rows of both ports: the middle and the three axes of the near one, and of the far one."""
@@ -393,3 +395,32 @@ class PoseParts(Parts):
         values, vectors = np.linalg.eigh(stiffness)
         positive = (vectors * np.maximum(values, 0.0)[:, None]) @ vectors.transpose(0, 2, 1)
         return back.transpose(0, 2, 1) @ positive @ back
+
+
+def curve_skin(near: Port, far: Port, length: float, outline: np.ndarray, nodes: np.ndarray) -> Skin:
+    """Sweep an outline along the cubic curve between two ports that leaves each along its first axis, to be drawn.
+
+    Args:
+        near: where the curve begins.
+        far: where it ends.
+        length: of the part [m], by which the curve bulges.
+        outline: corners [m] along the second and third axes, counter-clockwise, shape (k, 2).
+        nodes: rest rows [m], shape (n, 3).
+    """
+    s = np.linspace(0.0, 1.0, BRIDGE_SECTIONS)
+    shares = ((1.0 - s) ** 2 * (1.0 + 2.0 * s), length * s * (1.0 - s) ** 2, 1.0 - s)
+    others = (s**2 * (3.0 - 2.0 * s), length * s**2 * (s - 1.0), s)
+    weights = []
+    for port, (stay, leave, share) in ((near, shares), (far, others)):
+        directors = nodes[port.frame + 1 : port.frame + 4]
+        axes = directors @ port.axes  # in the directors of the frame, as columns
+        arm = directors @ (port.middle - nodes[port.frame])
+        places = (
+            stay[:, None, None] * arm
+            + leave[:, None, None] * axes[:, 0]
+            + share[:, None, None] * (outline @ axes[:, 1:].T)
+        )
+        weights += [np.broadcast_to(stay[:, None, None], (*places.shape[:2], 1)), places]
+    ids = np.tile(np.concatenate([near.frame + np.arange(4), far.frame + np.arange(4)]), (len(s) * len(outline), 1))
+    points = EmbeddedPoints.from_weights(ids, np.concatenate(weights, axis=2).reshape(-1, 8), nodes)
+    return Skin(points, swept_triangles(len(s), len(outline)), touches=False)
