@@ -11,13 +11,13 @@ from safetensors.numpy import load_file, save_file
 from softgym_envs import make_robot
 from softgym_envs.config import load_config, shipped_configs
 from softgym_envs.errors import DataError, WeightsError
+from softgym_envs.extensions.fitting.correction import fit_correction
 from softgym_envs.extensions.fitting.data.dataset import load_dataset
 from softgym_envs.extensions.fitting.trainer import Trainer
 from softgym_envs.extensions.fitting.training import NETWORKS, FitConfig, fit, generate_datasets
 from softgym_envs.extensions.hybrid import online
 from softgym_envs.extensions.networks import residual
 from softgym_envs.storage import hash_of
-from softgym_envs.surrogate.correction import fit_correction
 from softgym_envs.surrogate.model import Context, SurrogateModel, definite, exceeds_softening
 from softgym_envs.surrogate.potential import kernels
 from softgym_envs.surrogate.potential.model import Model

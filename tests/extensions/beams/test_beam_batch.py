@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import softgym_envs  # noqa: F401 - registers the environments
-from softgym_envs.backends import fem_batch
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.envs.parallel import ParallelVectorEnv
 from softgym_envs.envs.vector_env import SoftRobotVectorEnv
 from softgym_envs.errors import InfeasibleDesign
+from softgym_envs.extensions.beams import fem_batch
 from softgym_envs.extensions.beams.fem_batch import FEMBatch
 from softgym_envs.extensions.beams.robots.tetrapod import Tetrapod
 from softgym_envs.extensions.beams.solver.batch import BeamBatch

@@ -10,6 +10,7 @@ import pytest
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.extensions.beams.robots.stiff_flop import StiffFlop
 from softgym_envs.extensions.beams.robots.tetrapod import Tetrapod
+from softgym_envs.extensions.beams.solver import block_cholesky
 from softgym_envs.extensions.beams.solver.body import is_beam_body
 from softgym_envs.extensions.beams.solver.equations import Step, assemble, point_strains
 from softgym_envs.extensions.beams.solver.frames import motion_of, move
@@ -18,7 +19,6 @@ from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.elements.beams import Section
-from softgym_envs.mechanics.solvers import block_cholesky
 from softgym_envs.mechanics.solvers.dynamics import Dynamics
 from softgym_envs.mechanics.solvers.schemes import ImplicitEuler
 from softgym_envs.mechanics.solvers.statics import Statics

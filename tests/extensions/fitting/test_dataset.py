@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 
 from softgym_envs import make_robot
 from softgym_envs.errors import ConvergenceError, DataError, DesignError, InfeasibleDesign
+from softgym_envs.extensions.beams.robots import stiff_flop
 from softgym_envs.extensions.fitting.data import dataset, sampling
 from softgym_envs.extensions.fitting.data.dataset import COLUMNS, generate_dataset, load_dataset
 from softgym_envs.extensions.fitting.data.sampling import (
@@ -31,7 +32,6 @@ from softgym_envs.extensions.fitting.data.sampling import (
     solve_path,
 )
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.robots import stiff_flop
 from softgym_envs.surrogate.features import learned_variables
 from tests.helpers import live_processes, wait_until
 
