@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -168,7 +169,24 @@ class RandomAgent:
         return np.asarray(inner.spaces.action(inner.robot.balanced(inner.spaces.command(action, present)), present))
 
 
-BASELINES = Table(
+class Agents(Table):
+    """Agents by name; some can take what a policy has learned: ``"steer:POLICY"``."""
+
+    def __contains__(self, name: object) -> bool:
+        kind, _, policy = str(name).partition(":")
+        return super().__contains__(name) or bool(policy and super().__contains__(kind))
+
+    def __getitem__(self, name: str) -> Any:
+        kind, _, policy = name.partition(":")
+        found = super().__getitem__(kind)
+        if not policy:
+            return found
+        if not getattr(found, "takes_policy", False):
+            raise ValueError(f"agent '{kind}' takes no policy, got '{policy}'; allowed: {kind}")
+        return partial(found, policy=policy)
+
+
+BASELINES = Agents(
     "agent",
     {
         "qp": f"{__name__}:InverseQPAgent",
@@ -179,7 +197,10 @@ BASELINES = Table(
     },
     group="softgym_envs.agents",
 )
-"""Agents that need no training by name: classes whose only argument is a seed, with a ``title`` for tables."""
+"""Agents that need no training by name: classes whose argument is a seed, with a ``title`` for tables.
+
+Those with a true ``takes_policy`` have another argument, a policy.
+"""
 
 
 def make_baseline(name: str, seed: int = 0) -> Agent:
@@ -190,11 +211,12 @@ def make_baseline(name: str, seed: int = 0) -> Agent:
             step, unless the task names another agent for its goals (`Task.qp_agent`); ``"qp_static"``: on the static
             equilibrium under the present command, without momentum; ``"qp_model"``: on the surrogate, whatever the
             plant is; ``"qp_pi"``: as ``"qp_model"``, with a PI controller on the measured effector; ``"random"``:
-            uniform actions; or one of an installed package.
+            uniform actions; or one of an installed package, some of which take a policy: ``"steer:POLICY"``.
         seed: seed of the random agent.
 
     Raises:
         ValueError: for an unknown name.
+        WeightsError: for a policy that cannot be read, or does not fit.
     """
     agent: Agent = BASELINES.find(name)(seed)
     return agent

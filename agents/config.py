@@ -37,7 +37,8 @@ class EnvironmentConfig(Config):
 
     A robot and a task are registered names or paths such as ``my_module:MyRobot``; in Python they may be classes, which
     are stored as their paths. With ``residual_scale`` the agent corrects the inverse QP, or what stands for it in the
-    task (`Task.qp_agent`): the executed action is ``clip(QP action + residual_scale * agent action, -1, 1)``.
+    task (`Task.qp_agent`), or the agent ``residual_on``: the executed action is ``clip(its action + residual_scale *
+    agent action, -1, 1)``.
 
     Attributes:
         id: ID of an environment, in place of robot and task.
@@ -54,6 +55,7 @@ class EnvironmentConfig(Config):
         backend_options: options of the backend.
         plant: how the robot differs from its model, fixed or drawn at each reset (`softgym_envs.envs.plant`).
         residual_scale: factor of the agent's action when it is added to that of the QP; 0 for no QP.
+        residual_on: agent that needs no training in place of the QP, where environments run one by one.
     """
 
     id: str | None = None
@@ -70,6 +72,7 @@ class EnvironmentConfig(Config):
     backend_options: Annotated[dict[str, Any], BesideConfig()] = {}
     plant: dict[str, float | tuple[float, float] | dict[str, float | tuple[float, float]]] | None = None
     residual_scale: float = Field(default=0.0, ge=0, le=2)
+    residual_on: str | None = None
 
     @model_validator(mode="before")
     @classmethod
@@ -100,6 +103,11 @@ class EnvironmentConfig(Config):
         if "backend" not in self.model_fields_set:
             backend = row.backend or default_backend(self.make_robot(), self.backend_options)
             object.__setattr__(self, "backend", backend)
+        if self.residual_on is not None and (not self.residual_scale or self.batched):
+            raise ValueError(
+                f"residual_on = '{self.residual_on}' needs residual_scale > 0 and an environment that is not batched, "
+                f"got residual_scale = {self.residual_scale:g} and {self.title} on backend '{self.backend}'"
+            )
         return self
 
     @property
@@ -140,6 +148,11 @@ class EnvironmentConfig(Config):
         del options["backend"]
         return set_up(row.robot, row.task, self.backend, EnvironmentOptions.check(options)).batched
 
+    @property
+    def uncorrected(self) -> EnvironmentConfig:
+        """The same environment for agents that act alone, without residual."""
+        return self.model_copy(update={"residual_scale": 0.0, "residual_on": None})
+
     def on(self, backend: str) -> EnvironmentConfig:
         """Return the same environment on another backend, with those options of the present one that mean the same."""
         options = self.backend_options if backend == self.backend else shared_options(self.backend_options)
@@ -169,7 +182,7 @@ class EnvironmentConfig(Config):
         return self.row.spec(self.id or "SoftGym/Configured-v0")
 
     def _options(self, overrides: dict[str, Any]) -> dict[str, Any]:
-        options = self.model_dump(exclude={"id", "robot", "task", "max_episode_steps", "residual_scale"})
+        options = self.model_dump(exclude={"id", "robot", "task", "max_episode_steps", "residual_scale", "residual_on"})
         return {**options, **overrides}
 
     def make(self, **overrides: Any) -> gymnasium.Env:
@@ -182,7 +195,7 @@ class EnvironmentConfig(Config):
     def _wrapped(self, env: gymnasium.Env) -> gymnasium.Wrapper:
         from softgym_envs.agents.residual import ResidualQP
 
-        return ResidualQP(env, self.residual_scale)
+        return ResidualQP(env, self.residual_scale, self.residual_on or "qp")
 
     def make_vec(self, num_envs: int, **overrides: Any) -> gymnasium.vector.VectorEnv:
         """Return the batched environment if there is one, else one process per environment."""

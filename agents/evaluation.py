@@ -268,7 +268,12 @@ def check_agent(agent: str | Path) -> None:
     """
     name = str(agent)
     names = [*BASELINES, *shipped_policies()]
-    if name in names or name.endswith(".safetensors") or (Path(name) / "policy.safetensors").is_file():
+    if (
+        name in BASELINES
+        or name in names
+        or name.endswith(".safetensors")
+        or (Path(name) / "policy.safetensors").is_file()
+    ):
         return
     if name in LEARNERS:
         raise ConfigError(
@@ -351,7 +356,7 @@ def evaluate(
     if not (design is None or isinstance(design, Mapping)) and len(design) != len(goals):
         raise ValueError(f"design must be one body or one for each of {len(goals)} goals, got {len(design)}")
     if agent in BASELINES:
-        environment = environment.model_copy(update={"residual_scale": 0.0})
+        environment = environment.uncorrected
     else:
         Policy(agent).check_environment(environment)
     together = environment.batched and (agent not in BASELINES or (agent == "qp" and len(goals) > 1))

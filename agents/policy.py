@@ -257,6 +257,7 @@ def _meaning(environment: EnvironmentConfig, any_task: bool) -> dict[str, tuple[
             f"{environment.title} (robot {row.robot}, task {row.task})",
         ),
         "residual_scale": (environment.residual_scale, environment.residual_scale),
+        "residual_on": (environment.residual_on, environment.residual_on),
         "action_mode": (environment.action_mode, environment.action_mode),
         "design_in_observation": (shown, list(shown)),
         "robot_options": (scales, environment.robot_options),

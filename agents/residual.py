@@ -1,4 +1,4 @@
-"""Residual learning: environments in which the agent's action corrects that of the inverse QP.
+"""Residual learning: environments in which the agent's action corrects that of the inverse QP or another agent.
 
 Johannink et al., Residual reinforcement learning for robot control, 2019.
 Silver et al., Residual policy learning, 2018.
@@ -11,7 +11,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from softgym_envs.agents.baselines import InverseQPAgent, make_controller
+from softgym_envs.agents.baselines import make_baseline, make_controller
 from softgym_envs.envs.vector_env import SoftRobotVectorEnv
 
 
@@ -21,19 +21,20 @@ class ResidualQP(gymnasium.ActionWrapper):
     Args:
         env: a `SoftRobotEnv`, wrapped or not.
         scale: factor of the agent's action.
+        on: agent that is corrected, see `make_baseline`.
     """
 
-    def __init__(self, env: gymnasium.Env, scale: float) -> None:
+    def __init__(self, env: gymnasium.Env, scale: float, on: str = "qp") -> None:
         super().__init__(env)
-        self.scale = scale
-        self._qp = InverseQPAgent()
+        self.scale, self.on = scale, on
+        self._qp = make_baseline(on)
 
     def __getstate__(self) -> dict[str, Any]:
         return _without_qp(self)
 
     def __setstate__(self, kept: dict[str, Any]) -> None:
         self.__dict__.update(kept)
-        self._qp = InverseQPAgent()
+        self._qp = make_baseline(self.on)
 
     def action(self, action: np.ndarray) -> np.ndarray:
         """Return the action for the wrapped environment, shape (n_a,)."""

@@ -113,7 +113,7 @@ def episode_commands(
 ) -> list[np.ndarray]:
     """Return the commands of the states of one episode for each goal (k, 3) [m], each of shape (steps + 1, n_a)."""
     if agent == "qp":  # alone, not on top of another one
-        environment = environment.model_copy(update={"residual_scale": 0.0})
+        environment = environment.uncorrected
     act, env = make_agent(agent), environment.make(sample_design=False)
     inner: Any = env.unwrapped
     found = []

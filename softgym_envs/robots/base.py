@@ -227,11 +227,12 @@ class Robot(ABC):
         """
         raise ValueError(f"robot '{self.name}' has no reference gait: define reference_gait")
 
-    def steered_gait(self, turn: float) -> np.ndarray:
-        """Return the reference gait, changed so that the robot turns, shape (p, n_a).
+    def steered_gait(self, turn: float, gait: np.ndarray | None = None) -> np.ndarray:
+        """Return a gait, changed so that the robot turns, shape (p, n_a).
 
         Args:
-            turn: from -1, to the right as fast as this gait can, over 0, the reference gait, to 1, to the left.
+            turn: from -1, to the right as fast as this gait can, over 0, straight ahead, to 1, to the left.
+            gait: commands of one period, shape (p, n_a); default the reference gait.
 
         Raises:
             ValueError: if the robot has none.

@@ -174,6 +174,21 @@ def _over_time(name: str, values: np.ndarray | None, shape: tuple[int, ...]) -> 
     return out
 
 
+def empty_tape(steps: int, x: np.ndarray, size: int, anchors: np.ndarray | None) -> Tape:
+    """Return a tape with room for time steps of a body with rows ``x`` (n, 3), ``size`` constraint rows and anchors."""
+    room = ROOM * steps + 64
+    return Tape(
+        x=np.empty((room + 1, *x.shape)),
+        velocity=np.empty((room + 1, *x.shape)),
+        effort=np.empty((room + 1, size)),
+        anchors=None if anchors is None else np.empty((room + 1, *anchors.shape)),
+        h=np.empty(room),
+        number=np.empty(room, dtype=np.int64),
+        share=np.empty(room),
+        last=np.zeros(room, dtype=bool),
+    )
+
+
 def roll_out(
     dynamics: Dynamics,
     commands: np.ndarray,
@@ -215,17 +230,7 @@ def roll_out(
         targets[:, count : count + sum(c.size for c in dynamics.model.constraints["e"])] = forces
     contact, touching = beams.body.contact, dynamics.linearisation.contact
     anchors = None if contact is None or touching is None else anchors_of(contact, touching.memory)
-    room = ROOM * len(commands) + 64
-    tape = Tape(
-        x=np.empty((room + 1, *dynamics.x.shape)),
-        velocity=np.empty((room + 1, *dynamics.x.shape)),
-        effort=np.empty((room + 1, size)),
-        anchors=None if anchors is None else np.empty((room + 1, *anchors.shape)),
-        h=np.empty(room),
-        number=np.empty(room, dtype=np.int64),
-        share=np.empty(room),
-        last=np.zeros(room, dtype=bool),
-    )
+    tape = empty_tape(len(commands), dynamics.x, size, anchors)
     state = BeamState(
         dynamics.x.copy(), dynamics.velocity.copy(), dynamics.effort.copy(), np.empty(size), anchors, np.zeros(7)
     )

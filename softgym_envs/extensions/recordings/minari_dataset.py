@@ -46,7 +46,7 @@ def record_episodes(
     import minari
 
     act = make_agent(agent, seed)
-    made = environment.model_copy(update={"residual_scale": 0.0}) if agent in BASELINES else environment
+    made = environment.uncorrected if agent in BASELINES else environment
     env = minari.DataCollector(made.make(), record_infos=True)
     try:
         for number in range(episodes):

@@ -120,7 +120,7 @@ def moments(commands: np.ndarray) -> list[int]:
 def _run(config: StudyConfig, role: str, body: Finalist, policy: Path | None, path: np.ndarray) -> Episode:
     environment = finalist_environment(config, "fem", body.options)
     if policy is None:  # the QP alone, not on top of another one
-        environment = environment.model_copy(update={"residual_scale": 0.0})
+        environment = environment.uncorrected
     controller = "qp" if policy is None else policy
     commands = None
     if config.finalists.test == "ends":

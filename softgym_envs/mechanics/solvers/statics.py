@@ -5,7 +5,8 @@ Each increment is solved by `Newton`; one that fails is divided.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -290,6 +291,15 @@ class Statics(Newton):
                 return None
             self._special = found(self.model, self._assembly.mass_matrix(self._lumped))
         return self._special
+
+    @contextmanager
+    def solved_by(self, solver: CompiledSolver) -> Iterator[None]:
+        """Let another compiled solver of this body take its steps for a while, such as one that records them."""
+        kept, self._special = self._special, solver
+        try:
+            yield
+        finally:
+            self._special = kept
 
     @property
     def not_compiled(self) -> str | None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from softgym_envs.errors import ConvergenceError
+from softgym_envs.extensions.beams.recorder import Recorder
 from softgym_envs.extensions.beams.robots.tetrapod import Tetrapod
 from softgym_envs.extensions.beams.rollout import roll_out
 from softgym_envs.mechanics.contact.obstacles import Cylinder, Plane, Sphere
@@ -25,10 +26,10 @@ class Start:
         self.state = solver.x.copy(), solver.effort.copy(), solver.velocity.copy()
         self.memory = solver.memory
 
-    def roll(self, commands, *, mode="displacement", velocity=0.0):
+    def roll(self, commands, *, mode="displacement", velocity=0.0, force=None):
         x, effort, speed = self.state
         self.solver.restore(x, effort, speed + velocity, memory=self.memory)
-        return roll_out(self.solver, commands, mode)
+        return roll_out(self.solver, commands, mode, None if force is None else np.tile(force, (len(commands), 1)))
 
 
 @pytest.fixture(scope="module")
@@ -124,6 +125,46 @@ def test_derivatives_of_a_body_that_touches_nothing():
     solver = Dynamics(Tetrapod(elements=2).build(), step=H, stiffness_damping=0.02, mass_damping=0.5, tolerance=1e-11)
     commands = 0.01 * np.random.default_rng(2).normal(size=(20, 4)).cumsum(axis=0)
     check_commands(Start(solver), commands, 1e-6)
+
+
+def recorded(start, parts, push):
+    """Record a motion as an environment takes it, with the commands of each control step in one call."""
+    solver, (x, effort, speed) = start.solver, start.state
+    solver.restore(x, effort, speed, memory=start.memory)
+    recorder = Recorder(solver)
+    with solver.solved_by(recorder):
+        motions = [solver.advance_compiled(commands, effector_force=push)[1] for commands in parts]
+    return recorder, motions
+
+
+def test_steps_that_are_taken_anyway_can_be_recorded(walking):
+    """Control steps of five, two and one time steps, with a push."""
+    commands, push = np.array([trot(H * (k + 13)) for k in range(8)]), np.array([0.1, 0.2, 0.0])
+    x, effort, speed = walking.state
+    walking.solver.restore(x, effort, speed, memory=walking.memory)
+    plain = walking.solver.advance_compiled(commands, effector_force=push)[1]
+    whole = walking.roll(commands, force=push)
+    recorder, motions = recorded(walking, (commands[:5], commands[5:7], commands[7:]), push)
+    found = recorder.rollout()
+    assert motions[-1].equilibrium.x == pytest.approx(plain.equilibrium.x, abs=1e-10)
+    assert motions[-1].work == pytest.approx(plain.work, rel=1e-6)
+    assert motions[-1].dissipated == pytest.approx(plain.dissipated, rel=1e-6)
+    assert found.x == pytest.approx(whole.x, abs=1e-10) and found.effort.shape == whole.effort.shape
+    by_x = np.zeros_like(whole.x)
+    by_x[[2, -1], 0] = [0.3, 0.4, 0.5]
+    one, other = (rollout.gradient(by_x=by_x).commands for rollout in (found, whole))
+    assert one == pytest.approx(other, rel=1e-5, abs=1e-6 * np.abs(other).max())
+
+
+def test_what_was_not_recorded_has_no_gradient(walking):
+    with pytest.raises(ValueError, match="no motion was recorded"):
+        Recorder(walking.solver).rollout()
+    recorder, motions = recorded(walking, [np.full((2, 8), 1.0)], None)  # a million times the volume of a leg
+    assert motions == [None]
+    with pytest.raises(ConvergenceError, match="cannot be recorded"):
+        recorder.rollout()
+    with pytest.raises(ValueError, match="gradients need a body that compiled code can solve"):
+        Recorder(Dynamics(SoftFinger(mesh_size=0.02).build(), step=0.01))
 
 
 def test_what_cannot_be_rolled_out():

@@ -5,11 +5,15 @@ from __future__ import annotations
 import gymnasium
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 import softgym_envs  # noqa: F401 - registers the IDs
 from softgym_envs import make_robot
-from softgym_envs.agents.baselines import make_baseline
+from softgym_envs.agents.baselines import BASELINES, make_baseline
+from softgym_envs.agents.config import EnvironmentConfig
+from softgym_envs.agents.policy import Policy
 from softgym_envs.envs.tasks.registry import make_task
+from softgym_envs.errors import WeightsError
 
 ID = "SoftGym/QuadrupedFollow-v0"
 LEFT, RIGHT, BACK = [0.0, 0.04, 0.0], [0.0, -0.04, 0.0], [-0.04, 0.0, 0.0]
@@ -74,6 +78,36 @@ def test_a_steered_gait_follows_and_the_same_gait_without_does_not(steered):
     assert (
         np.abs(rewards - [sum(v for n, v in i.items() if n.startswith("reward_")) for i in infos[1:]]) < 1e-12
     ).all()
+
+
+def test_a_trained_gait_can_be_steered_too():
+    env, walk = gymnasium.make(ID).unwrapped, make_baseline("steer:quadruped_walk_gait")
+    observation, _ = env.reset(seed=0, options={"goal": [0.04, 0.0, 0.0]})
+    gait = Policy("quadruped_walk_gait").begin()  # reads the commands alone, which come first in both tasks
+    assert walk(observation, env) == pytest.approx(gait(observation), abs=1e-3)  # straight ahead
+    rewards, _, _ = episode(walk, steps=80, goal=LEFT)
+    straight, _, _ = episode(make_baseline("steer"), steps=80, goal=LEFT)
+    assert rewards.sum() > 1.2 * straight.sum()
+
+
+def test_agents_with_the_gait_of_a_policy_need_one():
+    assert "steer:quadruped_walk_gait" in BASELINES and "steer:" not in BASELINES and "qp:x" not in BASELINES
+    with pytest.raises(WeightsError, match="policy 'tetrapod_carry' has no gait"):
+        make_baseline("steer:tetrapod_carry")
+    with pytest.raises(WeightsError, match="unknown policy 'nothing'"):
+        make_baseline("steer:nothing")
+
+
+def test_a_residual_corrects_the_agent_it_is_told():
+    given = {"id": ID, "residual_scale": 0.5, "residual_on": "steer:quadruped_walk_gait"}
+    env = EnvironmentConfig(**given).make()
+    observation, _ = env.reset(seed=0)
+    expected = np.clip(make_baseline(given["residual_on"])(observation, env.unwrapped) + 0.25, -1.0, 1.0)
+    assert env.action(np.full(8, 0.5)) == pytest.approx(expected)
+    with pytest.raises(ValidationError, match="needs residual_scale > 0"):
+        EnvironmentConfig(id=ID, residual_on="gait")
+    with pytest.raises(ValidationError, match="not batched"):
+        EnvironmentConfig(id="SoftGym/FingerReach-v0", residual_scale=0.5, residual_on="qp")
 
 
 def test_rewards_never_exceed_the_way_along_the_headings(steered):

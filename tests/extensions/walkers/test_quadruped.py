@@ -9,6 +9,7 @@ import pytest
 
 from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
+from tests.extensions.walkers.driving import bodies_in_motion
 
 
 @pytest.fixture(scope="module")
@@ -16,31 +17,14 @@ def robot():
     return make_robot("quadruped")
 
 
-def bodies(robot):
-    """The baseline, two opposite corners, and bodies drawn from the box."""
-    space = robot.design_space
-    rng = np.random.default_rng(0)
-    units = [-np.ones(len(space)), np.ones(len(space)), *rng.uniform(-1.0, 1.0, (4, len(space)))]
-    return [space.baseline, *(space.from_unit(unit) for unit in units)]
-
-
 def test_every_body_stands_and_moves_in_compiled_code(robot):
     backend = FEMBackend(robot, dynamics=True)
-    rng = np.random.default_rng(1)
-    for design in bodies(robot):
-        backend.reset(design)
-        assert backend.not_compiled is None
+    for _ in bodies_in_motion(backend):
         for _ in range(10):
             state = backend.step(np.zeros(8))
         weight = 9.81 * backend.model.mass
         assert state.contacts.total[0] == pytest.approx([0.0, 0.0, weight], abs=1e-6 * weight)
         assert np.abs(state.velocity).max() < 1e-9
-        command = np.zeros(8)
-        for _ in range(5):
-            command = np.clip(command + rng.uniform(-1.0, 1.0, 8) * robot.rates, robot.lower, robot.upper)
-            state = backend.step(command)
-        assert state.displacement == pytest.approx(command, abs=1e-15)
-        assert state.trusted
 
 
 def test_mass_of_the_baseline(robot):

@@ -1,9 +1,9 @@
 """Analytic policy gradient over a short horizon of a motion (model-based): gaits with feedback.
 
-The policy acts in the environment. Behind each window of control steps, the derivative of the way ahead in that window
-goes back through contact and friction to all commands (`softgym_envs.extensions.beams.rollout`), and from there into
-the weights. What the robot will gain after the window is estimated from where it faces then: the closer to its heading,
-the more. There is no critic and no exploration noise.
+The policy acts in the environment, whose motion is recorded (`softgym_envs.extensions.beams.recorder`). Behind each
+window of control steps, the derivative of the way ahead in that window goes back through contact and friction to all
+commands, and from there into the weights. What the robot will gain after the window is estimated from where it faces
+then: the closer to its heading, the more. There is no critic and no exploration noise.
 
 The derivative leaves out how the policy reacts to states of the body that its commands change; it contains how it
 reacts to commands, which it observes too. Where no command can be improved, it vanishes as the whole one does. Compare
@@ -23,7 +23,7 @@ from pydantic import Field
 from softgym_envs.agents.config import TrainConfig
 from softgym_envs.agents.learners.network import NetworkLearner, RateConfig
 from softgym_envs.errors import ConvergenceError
-from softgym_envs.extensions.beams.rollout import roll_out_backend
+from softgym_envs.extensions.beams.recorder import recording
 from softgym_envs.extensions.walkers.learners.gait import (
     TIGHTNESS,
     check_compiled,
@@ -183,24 +183,22 @@ class HorizonLearner(NetworkLearner):
         import torch
 
         settings, task, backend, row = self.config.settings, env.task, env.backend, env.robot.body_frame
-        begin, observations, phases, commands, forces = backend.snapshot(), [], [], [], []
+        observations, phases = [], []
         places, directions = [env.state.nodes[row].copy()], []
-        for _ in range(settings.horizon):
-            observations.append(observation)
-            phases.append(env.steps % settings.period)
-            forces.append(np.zeros(3) if task.load is None else task.load.at(env.steps))
-            with torch.no_grad():
-                action = self._act(torch.from_numpy(observation), phases[-1]).numpy()
-            observation, _, _, lost, _ = env.step(action)
-            if lost:
-                return None, None
-            commands.append(env.command.copy())
-            directions.append(task.turn_to()[0])
-            places.append(env.state.nodes[row].copy())
-        ahead, end, parts = task.turn_to(task.lookahead)[0], backend.snapshot(), backend.steps.count
+        with recording(backend) as recorder:
+            for _ in range(settings.horizon):
+                observations.append(observation)
+                phases.append(env.steps % settings.period)
+                with torch.no_grad():
+                    action = self._act(torch.from_numpy(observation), phases[-1]).numpy()
+                observation, _, _, lost, _ = env.step(action)
+                if lost:
+                    return None, None
+                directions.append(task.turn_to()[0])
+                places.append(env.state.nodes[row].copy())
+        ahead, parts = task.turn_to(task.lookahead)[0], backend.steps.count
         try:
-            backend.resume(begin)
-            rollout = roll_out_backend(backend, np.array(commands), np.array(forces))
+            rollout = recorder.rollout()
             by_x = np.zeros_like(rollout.x)
             for k, along in enumerate(directions):
                 left = np.array([-along[1], along[0], 0.0])
@@ -213,8 +211,6 @@ class HorizonLearner(NetworkLearner):
             by_command = command_gradient(rollout.gradient(by_x=by_x).commands, parts)
         except ConvergenceError:
             return observation, None
-        finally:
-            backend.resume(end)
         return observation, Window(np.array(observations), np.array(phases), by_command * self._half)
 
     def _loss(self, windows: list[Window]) -> torch.Tensor:

@@ -148,14 +148,17 @@ class Quadruped(Robot):
 
     def reference_gait(self) -> np.ndarray:
         """Trot, shape (10, 8): diagonal legs swing and stretch together, the other two half a period later."""
-        return self.steered_gait(0.0)
-
-    def steered_gait(self, turn: float) -> np.ndarray:
-        """That trot with shorter swings, or swings backwards, on the side to which the robot turns, shape (10, 8)."""
         phase = 2.0 * np.pi * np.arange(PERIOD)[:, None] / PERIOD + np.pi * np.array([0.0, 1.0, 1.0, 0.0])
-        sides = np.array([y for _, y in LEGS.values()])
-        swing, stretch = np.sin(phase) * (1.0 - 2.0 * (turn * sides).clip(min=0.0)), 0.5 * (1.0 + np.cos(phase))
+        swing, stretch = np.sin(phase), 0.5 * (1.0 + np.cos(phase))
         return TROT * np.stack([stretch - swing, stretch + swing], axis=2).reshape(PERIOD, -1)
+
+    def steered_gait(self, turn: float, gait: np.ndarray | None = None) -> np.ndarray:
+        """A gait with shorter swings, or swings backwards, on the side to which the robot turns; default the trot."""
+        rear, front = np.moveaxis((self.reference_gait() if gait is None else gait).reshape(-1, len(LEGS), 2), 2, 0)
+        swing, stretch = 0.5 * (front - rear), 0.5 * (front + rear)
+        middle, sides = swing.mean(axis=0), np.array([y for _, y in LEGS.values()])
+        swing = middle + (swing - middle) * (1.0 - 2.0 * (turn * sides).clip(min=0.0))
+        return np.stack([stretch - swing, stretch + swing], axis=2).reshape(len(swing), -1)
 
     def reference_path(self, count: int = 30) -> np.ndarray:
         """Straight ahead by two lengths of the trunk, shape (count, 3)."""
