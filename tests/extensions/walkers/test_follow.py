@@ -91,7 +91,9 @@ def test_a_trained_gait_can_be_steered_too():
 
 
 def test_agents_with_the_gait_of_a_policy_need_one():
-    assert "steer:quadruped_walk_gait" in BASELINES and "steer:" not in BASELINES and "qp:x" not in BASELINES
+    assert "steer:quadruped_walk_gait" in BASELINES and "steer:" not in BASELINES and "octopus:x" not in BASELINES
+    with pytest.raises(ValueError, match="agent 'qp' takes no policy, got 'x'; allowed: qp"):
+        make_baseline("qp:x")
     with pytest.raises(WeightsError, match="policy 'tetrapod_carry' has no gait"):
         make_baseline("steer:tetrapod_carry")
     with pytest.raises(WeightsError, match="unknown policy 'nothing'"):
