@@ -34,6 +34,6 @@ def test_a_search_pays_for_its_gradients_and_keeps_to_its_budget():
 
 
 def test_problems_without_a_distance_to_points_are_refused():
-    for name, message in (("finger-press-v1", "distance to points"), ("finger-front-v1", "unknown method 'gradient'")):
+    for name, message in (("finger-press-v2", "distance to points"), ("finger-front-v1", "unknown method 'gradient'")):
         with pytest.raises(ValueError, match=message):
             make_optimiser("gradient", load_problem(name), 0)
