@@ -33,7 +33,7 @@ from softgym_envs.config import load_config
 from softgym_envs.errors import DataError
 from softgym_envs.robots.registry import make_robot
 from softgym_envs.surrogate.pretrained import pretrained_folder, shipped_robots
-from softgym_envs.units import display
+from softgym_envs.units import display, effort_unit
 from softgym_envs.wording import decimal
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -112,16 +112,26 @@ def drives(study: str) -> str:
     return f"drives to {' and '.join(ends)}{'' if any(robot.gravity) else ', no weight'}".replace(" ", "\u00a0")
 
 
+def efforts(study: str, row: dict[str, Any]) -> str:
+    """Return the mean efforts of baseline and winner, in the unit of the drives of a study's robot."""
+    robot = load_config(ROOT / "configs" / "codesign" / f"{study}.yaml", StudyConfig).robot
+    shown = display(effort_unit(robot.actuators[0].unit))
+    values = (shown.factor * row[f"{who}, mean effort [N]"] for who in ("baseline", "winner"))  # in SI units, not all N
+    return f"{' → '.join(format(value, '.2g') for value in values)} {shown.unit}".replace(" ", "\u00a0")
+
+
 def headlines() -> str:
     """Studies: mean distance to the test goals on FEM, from the baseline to the winner, and on a finer mesh."""
     lines = [
-        "| robot; controller; drives | baseline | winner | change, 95% | study's → finer mesh | command |",
-        "| --- | --: | --: | --: | --: | --- |",
+        "| robot; controller; drives | baseline | winner | change, 95% | study's → finer mesh "
+        "| mean effort | command |",
+        "| --- | --: | --: | --: | --: | --: | --- |",
     ]
     for key in HEADLINES:
         study = records()["codesign"]["results"][key]
         row = study["rows"][0]
-        finer = next((r for r in study.get("meshes", ()) if r["judge"] == "finite elements, finer mesh"), None)
+        judged = {judge["judge"]: judge for judge in study["meshes"]}
+        finer = judged.get("finite elements, finer mesh")
         # No-break spaces keep numbers and units together.
         ends = [decimal(row[f"{who} [mm]"], 2) for who in ("baseline", "winner")]
         low, high = row.get("change with the mesh, 95% interval [mm]") or row["change, 95% interval [mm]"]
@@ -135,6 +145,7 @@ def headlines() -> str:
             f"→\u00a0{ends[1]}\u00a0mm",
             f"{low:.1f}\u00a0to\u00a0{high:.1f}\u00a0mm",
             checked,
+            efforts(key, judged["finite elements"]),
             f"`{study['command']}`",
         ]
         lines.append(f"| {' | '.join(cells)} |")
