@@ -5,6 +5,7 @@ The suite's own extensions (`softgym_envs.extensions`) are found through the sam
 
 from __future__ import annotations
 
+import ast
 import inspect
 import os
 import re
@@ -20,6 +21,20 @@ from typing import Any, get_type_hints
 from softgym_envs.arguments import described, is_a
 from softgym_envs.errors import unknown_name
 from softgym_envs.wording import brief
+
+
+def _class_of_file(name: str) -> str:
+    """Return ``"module:Class"`` for a name of a file of the current folder, such as ``module.py`` or ``module.Class``.
+
+    The file is read, not run. It is empty if there is no such file, or one without classes.
+    """
+    module, _, given = name.removesuffix(".py").partition(".")
+    try:
+        tree = ast.parse(Path(f"{module}.py").read_bytes()) if module.isidentifier() else ast.Module([], [])
+    except (OSError, SyntaxError, ValueError):
+        return ""
+    classes = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
+    return f"{module}:{given if given in classes else classes[-1]}" if classes else ""
 
 
 class Table(Mapping[str, Any]):
@@ -155,6 +170,8 @@ class Registry(Table):
             return self._checked(name_or_class)
         if ":" in name_or_class and name_or_class not in self:
             return self._checked(import_place(self.kind, name_or_class))
+        if name_or_class not in self and (place := _class_of_file(name_or_class)):
+            raise ValueError(f"unknown {self.kind} '{name_or_class}'; did you mean '{place}'?")
         found: type = self.find(name_or_class)
         return found
 

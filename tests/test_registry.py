@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 
 import pytest
@@ -178,6 +179,17 @@ def test_a_missing_import_inside_a_module_is_not_hidden(registry, tmp_path, monk
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(ModuleNotFoundError, match="no_such_dependency"):
         registry.make("half_installed:Disc")
+
+
+@pytest.mark.parametrize("name", ["grabber", "grabber.py", "grabber.Claw", "grabber.Clau"])
+def test_a_file_of_the_current_folder_is_named_as_its_class_is(registry, tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "grabber.py").write_text("import nowhere\n\nclass Helper: ...\n\nclass Claw: ...\n")  # it is not run
+    with pytest.raises(ValueError, match=f"unknown shape '{re.escape(name)}'; did you mean 'grabber:Claw'\\?$"):
+        registry.resolve(name)
+    (tmp_path / "grabber.py").write_text("class Claw(:\n")
+    with pytest.raises(ValueError, match="or one of your own as 'module:Class'"):
+        registry.resolve(name)
 
 
 def test_entry_points_of_installed_packages(tmp_path, monkeypatch):
