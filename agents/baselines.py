@@ -170,14 +170,14 @@ class RandomAgent:
 
 
 class Agents(Table):
-    """Agents by name; some can take what a policy has learned: ``"steer:POLICY"``."""
+    """Agents by name; some can take what a policy has learned: ``"steer@POLICY"``."""
 
     def __contains__(self, name: object) -> bool:
-        kind, _, policy = str(name).partition(":")
+        kind, _, policy = str(name).partition("@")
         return super().__contains__(name) or bool(policy and super().__contains__(kind))
 
     def __getitem__(self, name: str) -> Any:
-        kind, _, policy = name.partition(":")
+        kind, _, policy = name.partition("@")
         found = super().__getitem__(kind)
         if not policy:
             return found
@@ -211,7 +211,7 @@ def make_baseline(name: str, seed: int = 0) -> Agent:
             step, unless the task names another agent for its goals (`Task.qp_agent`); ``"qp_static"``: on the static
             equilibrium under the present command, without momentum; ``"qp_model"``: on the surrogate, whatever the
             plant is; ``"qp_pi"``: as ``"qp_model"``, with a PI controller on the measured effector; ``"random"``:
-            uniform actions; or one of an installed package, some of which take a policy: ``"steer:POLICY"``.
+            uniform actions; or one of an installed package, some of which take a policy: ``"steer@POLICY"``.
         seed: seed of the random agent.
 
     Raises:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 AGENT_HELP = (
     "qp, qp_static, qp_model, qp_pi, qp_estimated, force, close, gait, steer, random, or a policy (a file, the folder "
-    "of a training or the name of a shipped one); gait:POLICY and steer:POLICY have the gait of a policy."
+    "of a training or the name of a shipped one); gait@POLICY and steer@POLICY have the gait of a policy."
 )
 
 

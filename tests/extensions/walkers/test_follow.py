@@ -81,7 +81,7 @@ def test_a_steered_gait_follows_and_the_same_gait_without_does_not(steered):
 
 
 def test_a_trained_gait_can_be_steered_too():
-    env, walk = gymnasium.make(ID).unwrapped, make_baseline("steer:quadruped_walk_gait")
+    env, walk = gymnasium.make(ID).unwrapped, make_baseline("steer@quadruped_walk_gait")
     observation, _ = env.reset(seed=0, options={"goal": [0.04, 0.0, 0.0]})
     gait = Policy("quadruped_walk_gait").begin()  # reads the commands alone, which come first in both tasks
     assert walk(observation, env) == pytest.approx(gait(observation), abs=1e-3)  # straight ahead
@@ -91,17 +91,17 @@ def test_a_trained_gait_can_be_steered_too():
 
 
 def test_agents_with_the_gait_of_a_policy_need_one():
-    assert "steer:quadruped_walk_gait" in BASELINES and "steer:" not in BASELINES and "octopus:x" not in BASELINES
+    assert "steer@quadruped_walk_gait" in BASELINES and "steer@" not in BASELINES and "octopus@x" not in BASELINES
     with pytest.raises(ValueError, match="agent 'qp' takes no policy, got 'x'; allowed: qp"):
-        make_baseline("qp:x")
+        make_baseline("qp@x")
     with pytest.raises(WeightsError, match="policy 'tetrapod_carry' has no gait"):
-        make_baseline("steer:tetrapod_carry")
+        make_baseline("steer@tetrapod_carry")
     with pytest.raises(WeightsError, match="unknown policy 'nothing'"):
-        make_baseline("steer:nothing")
+        make_baseline("steer@nothing")
 
 
 def test_a_residual_corrects_the_agent_it_is_told():
-    given = {"id": ID, "residual_scale": 0.5, "residual_on": "steer:quadruped_walk_gait"}
+    given = {"id": ID, "residual_scale": 0.5, "residual_on": "steer@quadruped_walk_gait"}
     env = EnvironmentConfig(**given).make()
     observation, _ = env.reset(seed=0)
     expected = np.clip(make_baseline(given["residual_on"])(observation, env.unwrapped) + 0.25, -1.0, 1.0)
