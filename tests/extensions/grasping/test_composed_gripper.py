@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import json
+import shutil
+
 import gymnasium
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
 from softgym_envs import make_robot
@@ -13,8 +17,10 @@ from softgym_envs.backends.surrogate import SurrogateBackend
 from softgym_envs.control import InverseQP
 from softgym_envs.errors import WeightsError
 from softgym_envs.extensions.deployment.surrogate_c import export_c
+from softgym_envs.extensions.fitting.cli import calibrate_trust
 from softgym_envs.extensions.fitting.data.dataset import generate_dataset, lost
 from softgym_envs.extensions.fitting.data.sampling import SamplingPlan
+from softgym_envs.extensions.fitting.within import calibrate_within
 from softgym_envs.extensions.grasping.backends.fingers import FingersBackend, FingersHybridBackend
 from softgym_envs.extensions.grasping.held_fingers import (
     Fingers,
@@ -30,7 +36,7 @@ from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.constraints.pose import Pose
 from softgym_envs.mechanics.frames import rotation_of
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.surrogate.pretrained import pretrained_model
+from softgym_envs.surrogate.pretrained import pretrained_folder, pretrained_model
 
 MESH_SIZE = 12e-3
 COMMAND = 1e-3 * np.array([8.0, 6.0, 2.0, 7.0, 9.0, 0.0, 4.0, 1.0, -1.0, 2.0])
@@ -312,6 +318,34 @@ def test_a_finger_out_of_its_domain_is_not_trusted(model):
     y[1, 0] = 4e-3
     assert not narrow.knows(y)
     assert LearnedFingers(model).knows(y)
+
+
+def test_the_factor_of_errors_stands_in_the_card(model):
+    y = np.array([[0.004, 0.003, 0.0, 0.001, 0.004, 0.1, 0.0, 0.0]])
+    plain, twice = (
+        LearnedFingers(type(model)(model.robot, model.tensors, {**model.card, "calibration": {"inflation": factor}}))
+        for factor in (1.0, 2.0)
+    )
+    np.testing.assert_allclose(twice.errors(y), 2.0 * plain.errors(y), rtol=1e-12)
+
+
+def test_calibration_by_whole_grippers_covers_their_errors(tmp_path):
+    """Also by the command line; the states of finite elements are kept and not solved again."""
+    robot = make_robot("composed_gripper")
+    shutil.copytree(pretrained_folder(robot.one_part()), tmp_path / "weights")
+    options = {"bodies": 2, "states": 2, "seed": 5, "state_folder": tmp_path / "states"}
+    found = calibrate_within(tmp_path / "weights", robot, **options)
+    card = json.loads((tmp_path / "weights" / "model.json").read_text())["calibration"]
+    assert card["within"] == "composed_gripper" and card["inflation"] > 0.0
+    assert set(found) == set(card["strata"]) == {"inside", "faces", "corners", "slack corners"}
+    assert all(row.coverage == 1.0 for row in found.values())
+    arguments = ["--weights", str(tmp_path / "weights"), "--folder", str(tmp_path / "states"), "--seed", "5"]
+    sizes = ["--bodies", "2", "--states", "2"]
+    result = CliRunner().invoke(calibrate_trust, ["composed_gripper", *arguments, *sizes])
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.output)["corners"]["mean"] == pytest.approx(found["corners"].mean, rel=1e-6)
+    refused = CliRunner().invoke(calibrate_trust, ["composed_gripper", "--test"])
+    assert "those of 'composed_gripper' are of its parts" in refused.output
 
 
 def test_models_of_other_robots_are_rejected():

@@ -4,7 +4,7 @@ A finger that holds a rigid object (thesis, sec. 4.3.2) touches it at three poin
 numbers therefore describe its state: the shortening of its two cables and the pose of the triangle. When all eight are
 driven, the finger's energy is a function of them, and its derivatives are the tensions of the cables and the wrench
 that the object exerts. The energy of a gripper of rotated and shifted copies is the sum of such functions
-(`softgym_envs.extensions.grasping.control.fingers`), so one learned model serves every finger of every gripper.
+(`softgym_envs.extensions.grasping.held_fingers`), so one learned model serves every finger of every gripper.
 
 That energy is not convex. A finger that is pulled and pushed at once is stable while its cables and pose are held, or
 in a gripper, but would buckle under constant forces: under random commands, two thirds of the fingers of the
@@ -32,7 +32,7 @@ class ContactFinger(FingerRobot):
 
     The actuators are the two cables, then the displacement x, y, z [m] of the frame's origin from rest and its rotation
     rx, ry, rz, the components of ``sin(angle) * axis`` [1]; see `softgym_envs.mechanics.constraints.Pose`. Their
-    ranges cover 99 % of the poses that occur in the three-finger gripper under random commands, over its design space;
+    ranges cover 96 % of the states on paths of grippers of two to five fingers, and those of 1+1 fingers turn furthest;
     the finger that presses a button rotates further (up to 90 degrees). The effector is the tip.
 
     Args:
