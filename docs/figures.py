@@ -166,7 +166,8 @@ def trust() -> str:
     for name, (robot, options) in shipped_robots().items():
         body = make_robot(robot, **options)
         card = json.loads((pretrained_folder(body) / "model.json").read_text())
-        cells = [f"`{name}`", f"{1e3 * body.goal_tolerance:.3g}"]
+        whole = make_robot(card["calibration"]["within"]) if "within" in card.get("calibration", {}) else body
+        cells = [f"`{name}`", f"{1e3 * whole.goal_tolerance:.3g}"]
         cells.append(lengths(card["test"]["effector_mean"], card["test"]["effector_worst"]))
         if strata := card.get("calibration", {}).get("strata"):
             ends = strata["inside"], strata["corners"]
