@@ -97,7 +97,8 @@ def evaluate(
     if config is not None and not any(others.values()):
         wanted = load_config(config, TrainConfig, overrides).environment
     elif overrides and "=" not in overrides[0]:
-        raise ConfigError(f"'{overrides[0]}' is not KEY=VALUE; an environment is named by --environment")
+        how = "an environment is named by --environment, a robot by --robot"
+        raise ConfigError(f"'{overrides[0]}' is not KEY=VALUE; {how}")
     elif overrides:
         raise ConfigError(f"'{overrides[0]}' changes a configuration: it needs --config, and no other environment")
     else:

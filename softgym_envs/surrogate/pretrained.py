@@ -94,7 +94,7 @@ def pretrained_model(robot: Robot, weights: str | Path | None = None, members: i
             raise WeightsError(f"no weights ship for '{folder.name}', which touches something: use backend='fem'")
         raise WeightsError(
             f"no weights ship for '{folder.name}': use backend='fem', or fit weights with 'softgym fit' and pass "
-            f"backend_options={{'weights': folder}}; shipped: {', '.join(shipped) or 'none'}"
+            f"backend_options={{'weights': folder}} (or --weights); shipped: {', '.join(shipped) or 'none'}"
         )
     return load_model(folder, robot, members)
 
