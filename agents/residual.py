@@ -6,6 +6,7 @@ Silver et al., Residual policy learning, 2018.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -27,7 +28,7 @@ class ResidualQP(gymnasium.ActionWrapper):
     def __init__(self, env: gymnasium.Env, scale: float, on: str = "qp") -> None:
         super().__init__(env)
         self.scale, self.on = scale, on
-        self._qp = make_baseline(on)
+        self._qp: Callable[[Any, Any], np.ndarray] = make_baseline(on)
 
     def __getstate__(self) -> dict[str, Any]:
         return _without_qp(self)
