@@ -102,19 +102,26 @@ def run(
 ) -> None:
     """Drive the robot through episodes of an environment, in real time.
 
-    The robot first goes home slowly, and again after each episode. Ctrl-C, a fault or a silent device takes the power
-    from all drives.
+    ENVIRONMENT is an ID; SoftGym/Reach-v0 and SoftGym/Track-v0 take the robot of the bench. The robot first goes home
+    slowly, and again after each episode. Ctrl-C, a fault or a silent device takes the power from all drives.
     """
     from softgym_envs.agents.evaluation import check_agent, make_agent
+    from softgym_envs.envs.registration import GENERIC_ENVIRONMENTS
     from softgym_envs.extensions.hardware.backend import HardwareBackend
 
     check_agent(agent)
-    wanted, act = environment_of_agents("hardware run", (agent,), "hardware", id=environment), make_agent(agent, seed)
-    scale, results = wanted.task_class.distance_scale, []
     config = _load(bench, overrides)
+    if environment in GENERIC_ENVIRONMENTS:
+        given = tuple(f"{name}={json.dumps(value)}" for name, value in config.robot_options.items())
+        named: dict[str, Any] = {"robot": config.robot, "options_": given}
+        named["task"] = GENERIC_ENVIRONMENTS[environment].task
+    else:
+        named = {"id": environment}
+    wanted, act = environment_of_agents("hardware run", (agent,), "hardware", **named), make_agent(agent, seed)
+    scale, results = wanted.task_class.distance_scale, []
     with _open(config, emulate) as found:
-        given: dict[str, Any] = {"bench": found, "log": None if log is None else str(log), "trial": trial}
-        env = wanted.make(backend_options=given, design=config.design or None)
+        on_bench: dict[str, Any] = {"bench": found, "log": None if log is None else str(log), "trial": trial}
+        env = wanted.make(backend_options=on_bench, design=config.design or None)
         body: Any = env.unwrapped
         backend: HardwareBackend = body.backend
         try:

@@ -28,11 +28,6 @@ from softgym_envs.robots.base import Actuator, Robot
 from softgym_envs.robots.capabilities import Learning
 from softgym_envs.robots.mesh_tiers import choose_mesh
 
-HORN = 22.5e-3
-"""Distance of a leg's root from its servo's axis, outwards [m]."""
-CENTRE_RADIUS = 13e-3
-"""Distance of the legs' tips from the middle of the centre part [m]; published as about 10 to 16 mm."""
-
 JOINT_GAP = 1.0e-3
 """Gap between the skins of the centre and of a leg where they are joined [m]: more than the distance of contact."""
 CENTRE_MASS = 0.020
@@ -55,7 +50,13 @@ class Tetrapod(Robot):
 
     A leg leaves the horn of its servo downwards and reaches the centre horizontally. By default it is printed straight,
     and the assembly bends it. With the published lengths, this gives the published rest height and workspace (see the
-    page of this robot).
+    page of this robot). A class derived from it may have other lengths.
+
+    Attributes:
+        horn: distance of a leg's root from its servo's axis, outwards [m].
+        centre_radius: distance of the legs' tips from the middle of the centre part [m]; published: 10 to 16 mm.
+        effector_depth: how far the effector is below the legs' tips [m].
+        baseline: length of a leg and distance of the servos from the middle [m].
 
     Args:
         payload: mass at the centre [kg].
@@ -67,11 +68,14 @@ class Tetrapod(Robot):
         **options: options of `Robot`.
     """
 
+    horn, centre_radius, effector_depth = 22.5e-3, 13e-3, 0.0
+    baseline = 0.205, 0.100
+
     name = "tetrapod"
     effectors = ("centre",)
     size = 0.2
     made_of_beams = True
-    learning = Learning(parts=("leg",))
+    learning = Learning(weights="tetrapod", parts=("leg",))
     backends = {
         "surrogate": "softgym_envs.extensions.beams.parts.backends:PartsBackend",
         "hybrid": "softgym_envs.extensions.beams.parts.backends:PartsHybridBackend",
@@ -102,11 +106,12 @@ class Tetrapod(Robot):
             DesignVariable(f"curvature_{k}", -8.0, 8.0, 0.0, "1/m", f"printed curvature of the leg, {place}; inwards")
             for k, place in ((1, "at its root"), (2, "in the middle"), (3, "at its tip"))
         ]
+        length, radius = self.baseline
         self.design_space = DesignSpace(
-            DesignVariable("leg_length", 0.190, 0.225, 0.205, "m", "length of a leg"),
+            DesignVariable("leg_length", 0.190, 0.225, length, "m", "length of a leg"),
             DesignVariable("leg_width", 0.005, 0.020, 0.010, "m", "width of its section, along the servo's axis"),
             DesignVariable("leg_thickness", 0.003, 0.008, 0.005, "m", "thickness of its section"),
-            DesignVariable("servo_radius", 0.090, 0.110, 0.100, "m", "distance of the servos from the middle"),
+            DesignVariable("servo_radius", 0.090, 0.110, radius, "m", "distance of the servos from the middle"),
             *bend,
             DesignVariable("young_modulus", 2.0e7, 6.0e7, 3.5e7, "Pa", "stiffness of the printed legs", log=True),
         )
@@ -132,7 +137,7 @@ class Tetrapod(Robot):
         middle = HANGING * UP
         centre = assembly.add_frame(middle)
         mass = CENTRE_MASS + self.payload
-        assembly.add_mass(centre, mass, sphere_inertia(mass, CENTRE_RADIUS))
+        assembly.add_mass(centre, mass, sphere_inertia(mass, self.centre_radius))
         section = Section.rectangle(design["leg_width"], design["leg_thickness"])
         servos, ports = [], []
         for k in range(4):
@@ -141,8 +146,8 @@ class Tetrapod(Robot):
             along = np.array([-math.sin(angle), math.cos(angle), 0.0])
             servo = assembly.add_frame(radius * outwards, fixed=True, fixed_spin=np.abs(along) < 0.5)
             servos.append((servo, -along))
-            root = (radius + HORN) * outwards
-            tip = middle + CENTRE_RADIUS * outwards
+            root = (radius + self.horn) * outwards
+            tip = middle + self.centre_radius * outwards
             if self.parts:
                 ports.append(
                     (
@@ -169,14 +174,14 @@ class Tetrapod(Robot):
         model = assembly.build()
         for actuator, (servo, axis) in zip(self.actuators, servos, strict=True):
             model.add("a", Servo(actuator.name, servo, axis, model.nodes))
-        model.add("e", Point("centre", EmbeddedPoints.in_frame(centre, np.zeros(3), model.nodes)))
+        model.add("e", Point("centre", EmbeddedPoints.in_frame(centre, -self.effector_depth * UP, model.nodes)))
         half = 0.5 * np.array([design["leg_width"], design["leg_thickness"]])
         outline = half * np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)])
         model.skins += [tube_skin(leg, model.nodes, outline) for leg in model.blocks if isinstance(leg, Beam)]
         model.skins += [curve_skin(near, far, length, outline, model.nodes) for near, far in ports]
         # The legs begin on the sides of the centre: it stays back, so that its skin and theirs do not touch there.
-        side = CENTRE_RADIUS - JOINT_GAP
-        model.skins.append(box_skin(centre, (side, side, 0.4 * CENTRE_RADIUS), model.nodes))
+        side = self.centre_radius - JOINT_GAP
+        model.skins.append(box_skin(centre, (side, side, 0.4 * self.centre_radius), model.nodes))
         return model
 
     def learned_mesh(self) -> Robot:
