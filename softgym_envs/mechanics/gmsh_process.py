@@ -1,4 +1,4 @@
-"""The process in which gmsh works: ``python -m ... JOB request.npz output.npz``; `run_gmsh` starts it.
+"""The process in which gmsh works: ``python -m ... JOB request.npz output.npz LIMIT``; `run_gmsh` starts it.
 
 gmsh may crash or hang on malformed input. Besides NumPy and gmsh the process imports next to nothing: loading SciPy and
 Numba would take longer than a coarse mesh.
@@ -7,6 +7,7 @@ Numba would take longer than a coarse mesh.
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -27,20 +28,53 @@ _TYPES = {4: "tetra", 5: "hexahedron", 6: "wedge", 7: "pyramid", 2: "triangle", 
 """Names of the cells of gmsh that are bodies and surfaces."""
 
 
+_HUNG = 600.0, 20.0
+"""Wall time [s], and the same over the limit of CPU time, after which a process is taken for hung: the larger one."""
+
+
 class GmshFailure(Exception):
     """What gmsh says about input that it cannot use."""
 
 
+def run_limited(
+    module: str, *arguments: str, time_limit: float, given: bytes = b""
+) -> subprocess.CompletedProcess[bytes]:
+    """Run a module in a process of its own, with a limit of its CPU time: nothing fails because a machine is busy.
+
+    Args:
+        module: to run; it calls `limit_cpu_time` first.
+        *arguments: of its command line.
+        time_limit: limit of its CPU time [s].
+        given: what it reads from its standard input.
+
+    Raises:
+        TimeoutError: if it takes longer, or hangs.
+    """
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    command, hung = [sys.executable, "-m", module, *arguments], max(_HUNG[0], _HUNG[1] * time_limit)
+    try:
+        done = subprocess.run(command, input=given, capture_output=True, timeout=hung, env=environment, check=False)
+    except subprocess.TimeoutExpired:
+        raise TimeoutError(f"did not end in {hung:.3g} s") from None
+    if done.returncode == -signal.SIGPROF:
+        raise TimeoutError(f"took longer than time_limit = {time_limit:.3g} s of CPU time")
+    return done
+
+
+def limit_cpu_time(seconds: float) -> None:
+    """End this process after some CPU time [s], whatever code it is in then."""
+    signal.setitimer(signal.ITIMER_PROF, max(seconds, 1e-6))
+
+
 def run_gmsh(
-    job: str, request: Mapping[str, Any], *, time_limit: float, used: float = 0.0, task: str, remedy: str
+    job: str, request: Mapping[str, Any], *, time_limit: float, task: str, remedy: str
 ) -> dict[str, np.ndarray]:
     """Run a job of gmsh in a separate process.
 
     Args:
         job: name of one of `JOBS`.
         request: its arrays and numbers.
-        time_limit: wall-clock limit [s].
-        used: part of it that is over already [s].
+        time_limit: limit of its CPU time [s].
         task: what is done, for messages: "meshing 'body.stl'".
         remedy: what to do if it takes too long.
 
@@ -51,19 +85,16 @@ def run_gmsh(
     with tempfile.TemporaryDirectory() as scratch:
         given, output = Path(scratch) / "request.npz", Path(scratch) / "output.npz"
         np.savez(given, **request)
-        command = [sys.executable, "-m", "softgym_envs.mechanics.gmsh_process", job, str(given), str(output)]
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+        arguments = job, str(given), str(output), str(time_limit)
         try:
-            done = subprocess.run(
-                command, capture_output=True, text=True, timeout=time_limit - used, env=environment, check=False
-            )
-        except subprocess.TimeoutExpired:
-            raise MeshingError(f"{task} took longer than time_limit = {time_limit:.3g} s; {remedy}") from None
+            done = run_limited("softgym_envs.mechanics.gmsh_process", *arguments, time_limit=time_limit)
+        except TimeoutError as problem:
+            raise MeshingError(f"{task} {problem}; {remedy}") from None
+        errors, said = (text.decode(errors="replace").strip() for text in (done.stderr, done.stdout))
         if done.returncode == UNUSABLE:
-            raise MeshingError(f"gmsh cannot be used: {done.stderr.strip().splitlines()[-1]}")
+            raise MeshingError(f"gmsh cannot be used: {errors.splitlines()[-1]}")
         if done.returncode != 0 or not output.is_file():
-            lines = (done.stderr.strip() or done.stdout.strip() or "it crashed").splitlines()
-            raise GmshFailure(lines[-1])
+            raise GmshFailure((errors or said or "it crashed").splitlines()[-1])
         with np.load(output) as data:
             return dict(data)
 
@@ -181,7 +212,8 @@ def _mesh(gmsh: ModuleType) -> dict[str, np.ndarray]:
 JOBS = {"fill": _fill_shells, "convert": _convert}
 
 
-def _main(job: str, request: str, output: str) -> None:
+def _main(job: str, request: str, output: str, time_limit: str) -> None:
+    limit_cpu_time(float(time_limit))
     import gmsh
 
     with np.load(request) as data:

@@ -59,7 +59,7 @@ def read_file(path: Path, *, mesh_size: float | None, time_limit: float) -> Any:
         path: of the file.
         mesh_size: edge length of the elements of shapes without a mesh, in metres for STEP and IGES, which state their
             unit, and in the file's unit for others; default: a twentieth of the diagonal.
-        time_limit: wall-clock limit for gmsh [s].
+        time_limit: limit of the CPU time of gmsh [s].
 
     Returns:
         A `meshio.Mesh`, in metres for STEP and IGES.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from itertools import permutations
 from typing import Any
 
@@ -40,7 +39,7 @@ def fill_surface(
         points: [m], shape (n, 3).
         triangles: point indices, shape (k, 3); coincident points count as one.
         mesh_size: edge length [m]; default: a twentieth of the diagonal.
-        time_limit: wall-clock limit [s].
+        time_limit: limit of the CPU time of each way of meshing that is tried [s].
         source: name of the surface in messages.
 
     Returns:
@@ -84,14 +83,13 @@ def _fill(
     request: dict[str, Any], volume: float, time_limit: float, source: str, size: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Fill shells by the first way of `_ANGLES` that works, and check the volume."""
-    count, start, last = len(request["triangles"]), time.monotonic(), ""
+    count, last = len(request["triangles"]), ""
     for angle in _ANGLES:
         try:
             found = run_gmsh(
                 "fill",
                 {**request, "angle": angle},
                 time_limit=time_limit,
-                used=time.monotonic() - start,
                 task=f"meshing '{source}', a surface of {count} triangles, with mesh_size = {size:.3g} m",
                 remedy="pass a larger time_limit, or a larger mesh_size",
             )

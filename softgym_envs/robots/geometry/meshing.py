@@ -12,10 +12,7 @@ import ast
 import hashlib
 import inspect
 import json
-import os
 import pickle
-import signal
-import subprocess
 import sys
 import tempfile
 import textwrap
@@ -34,9 +31,6 @@ from softgym_envs.storage import atomic_write, cache_directory, read_npz
 
 _FORMAT = 2
 # Exit statuses of the meshing process: gmsh is missing or does not load; gmsh rejects the shape; the drawing has a bug.
-_HUNG = 20.0
-"""Wall time of a meshing process over its limit of CPU time, after which it is taken for hung."""
-
 _NO_GMSH, _NO_SHAPE, _BUG = 3, 4, 5
 _SHIPPED = Path(__file__).parents[1] / "meshes"
 
@@ -259,16 +253,13 @@ def run_gmsh(request: dict, *, time_limit: float) -> None:
     """
     import cloudpickle  # also takes functions of scripts and notebooks
 
-    command = [sys.executable, "-m", "softgym_envs.robots.geometry.meshing"]
-    given = cloudpickle.dumps({**request, "time_limit": time_limit})
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
-    parameters, hung = request["parameters"], max(600.0, _HUNG * time_limit)
+    from softgym_envs.mechanics.gmsh_process import run_limited
+
+    given, parameters = cloudpickle.dumps({**request, "time_limit": time_limit}), request["parameters"]
     try:
-        done = subprocess.run(command, input=given, capture_output=True, timeout=hung, env=environment, check=False)
-    except subprocess.TimeoutExpired:
-        raise InfeasibleDesign(f"meshing did not end in {hung:g} s for {parameters}") from None
-    if done.returncode == -signal.SIGPROF:
-        raise InfeasibleDesign(f"meshing took longer than {time_limit:g} s of CPU time for {parameters}")
+        done = run_limited("softgym_envs.robots.geometry.meshing", time_limit=time_limit, given=given)
+    except TimeoutError as problem:
+        raise InfeasibleDesign(f"meshing {problem} for {parameters}") from None
     if done.returncode == 0:
         return
     text = done.stderr.decode(errors="replace").strip()
@@ -347,9 +338,11 @@ def _draw_here(request: dict) -> None:
 
 def _main() -> int:
     """Run as the meshing process; return its exit status."""
+    from softgym_envs.mechanics.gmsh_process import limit_cpu_time
+
     try:
         request = pickle.load(sys.stdin.buffer)
-        signal.setitimer(signal.ITIMER_PROF, request["time_limit"])  # ends the process, whatever code it is in
+        limit_cpu_time(request["time_limit"])
         _draw_here(request)
     except (ImportError, OSError) as problem:  # OSError: a system library that gmsh needs is missing
         print(explain(problem) or problem, file=sys.stderr)
