@@ -14,8 +14,8 @@ import yaml
 import softgym_envs
 from softgym_envs.agents.baselines import make_baseline
 from softgym_envs.backends.fem import FEMBackend
-from softgym_envs.extensions.hardware.bench import BenchConfig
 from softgym_envs.extensions.beams.robots.emio import Emio
+from softgym_envs.extensions.hardware.bench import BenchConfig
 from softgym_envs.extensions.hardware.simulated_time import emulated_bench
 
 PAGE = Path(softgym_envs.__file__).parents[1] / "docs" / "robots" / "emio.md"
