@@ -56,7 +56,7 @@ def calibrate_within(
     """Calibrate the weights of a part by the effector of whole bodies, and write the result to their card.
 
     What the members say about the part's efforts moves the effector by the compliance of the body. One factor scales
-    this such that it covers 95 % of the errors in every stratum.
+    this such that it covers 95 % of the errors of all strata together, which have equally many states.
 
     Args:
         folder: the weights of the part.
@@ -79,9 +79,8 @@ def calibrate_within(
     card["calibration"] = {"within": whole.name, "bodies": bodies, "states": states, "seed": seed, "inflation": 1.0}
     write_json(path, card)
     plain = predict_within(folder, whole, known)
-    ratio = plain.error / plain.uncertainty
-    strata = [plain.found & (known.stratum == stratum) for stratum in np.unique(known.stratum)]
-    card["calibration"]["inflation"] = max(conformal_quantile(ratio[rows]) for rows in strata if rows.any())
+    ratio = (plain.error / plain.uncertainty)[plain.found]
+    card["calibration"]["inflation"] = conformal_quantile(ratio)
     write_json(path, card)
     found = by_stratum(predict_within(folder, whole, known), known)
     card["calibration"]["strata"] = {name: asdict(row) for name, row in found.items()}
