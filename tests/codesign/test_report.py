@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import gymnasium
 import numpy as np
 import pytest
 from PIL import Image, ImageSequence
@@ -12,12 +13,13 @@ from softgym_envs.agents.evaluation import Evaluation
 from softgym_envs.codesign.collect import collect
 from softgym_envs.codesign.records import FinalistTest, TrialResult
 from softgym_envs.codesign.snapshot import load_study
-from softgym_envs.extensions.report.episodes import typical_goal
+from softgym_envs.extensions.report.episodes import Episode, typical_goal
 from softgym_envs.extensions.report.figures import search_figures
 from softgym_envs.extensions.report.findings import findings
-from softgym_envs.extensions.report.motion import goal_outcomes, goal_views
+from softgym_envs.extensions.report.motion import goal_outcomes, goal_views, motion
 from softgym_envs.extensions.report.sentences import headline
 from softgym_envs.extensions.report.tables import effort_rows
+from softgym_envs.mechanics import Plane
 from softgym_envs.viewer.video import write_video
 from softgym_envs.wording import time_text
 
@@ -159,6 +161,20 @@ def test_outcomes_of_goals(tested):
                 assert list(ends[name].x[1::3]) == pytest.approx(0.6 * np.array(distances))
                 assert list(ends[name].y[1::3]) == pytest.approx(-0.8 * np.array(distances))
     assert "yz" in dict(views)
+
+
+def test_bodies_move_beside_what_stands_in_their_way():
+    wall = Plane((0.0, 0.0, -0.2), (0.0, 0.0, 1.0))
+    env = gymnasium.make("SoftGym/Reach-v0", robot="finger", backend="fem", robot_options={"obstacles": [wall]})
+    _, info = env.reset(seed=0)
+    inner = env.unwrapped
+    shown = {"robot": inner.robot, "design": dict(inner.design), "model": inner.backend.model, "task": inner.task}
+    states = {"states": [inner.state] * 2, "goals": [inner.goal] * 2, "distances": [info["distance"]] * 2}
+    figure = motion([Episode("winner", **shown, path=inner.path, **states, rewards=[None] * 2)], None)
+    names = [trace.name for trace in figure.data]
+    assert names == ["winner", "path of the winner's effector", "obstacle", "goal of this episode"]
+    assert all(frame.traces == (0, 1) for frame in figure.frames)  # the obstacle stands still
+    np.testing.assert_allclose(figure.data[2].z, -200.0)
 
 
 def test_plots_show_every_complete_trial(tested):

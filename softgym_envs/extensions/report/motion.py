@@ -20,6 +20,8 @@ MAX_FRAMES = 24
 MAX_POINTS = 60_000
 """Largest number of surface points in all frames of a body, which bounds the size of the page."""
 
+OBSTACLE = "#9db4d4"
+
 GOAL_KINDS: tuple[tuple[str, str, str, str], ...] = (
     ("reached by both", "circle", "#1d4ed8", "●"),
     ("reached by the winner only", "diamond", WINNER, "◆"),
@@ -129,9 +131,13 @@ def _broken(lines: np.ndarray) -> list[float | None]:
 
 
 def motion(episodes: Sequence[Episode], outcomes: GoalOutcomes | None) -> Figure:
-    """Baseline and winner over each other at one goal, step by step, with all goals; it can be rotated and played."""
+    """Baseline and winner over each other at one goal, step by step, with all goals and what stands in the way.
+
+    It can be rotated and played.
+    """
     from plotly.graph_objects import Frame
 
+    from softgym_envs.viewer.scene import obstacle_skins
     from softgym_envs.viewer.surface import BodySurface
 
     surfaces = [BodySurface(episode.model) for episode in episodes]
@@ -154,6 +160,8 @@ def motion(episodes: Sequence[Episode], outcomes: GoalOutcomes | None) -> Figure
     for trace in traces(length - 1, whole=True):  # at first at the goal
         figure.add_trace(trace)
     moving = list(range(len(figure.data)))
+    for vertices, triangles in obstacle_skins(episodes[0].model, episodes[0].robot):
+        figure.add_trace(_surface_trace(vertices, triangles, "obstacle", OBSTACLE, 0.5))
     _add_goals(figure, episodes[0], outcomes)
     figure.frames = [Frame(name=str(k), data=traces(k, whole=False), traces=moving) for k in range(length)]
     _add_player(figure, episodes, picks, length)
@@ -202,20 +210,26 @@ def _scene() -> dict[str, Any]:
 
 def _body_trace(role: str, points: np.ndarray, faces: np.ndarray | None) -> dict[str, Any]:
     """Return a surface from points [m] (p, 3) and triangles (t, 3), which frames that only move it leave out."""
+    winner = role == "winner"
+    return _surface_trace(points, faces, role, WINNER if winner else BASELINE, 1.0 if winner else 0.3)
+
+
+def _surface_trace(
+    points: np.ndarray, faces: np.ndarray | None, name: str, colour: str, opacity: float
+) -> dict[str, Any]:
     x, y, z = (1e3 * points).T.astype(np.float32)
     trace: dict[str, Any] = {"type": "mesh3d", "x": x, "y": y, "z": z}
     if faces is not None:
         i, j, k = faces.T.astype(np.int32)
-        winner = role == "winner"
         trace |= {
             "i": i,
             "j": j,
             "k": k,
-            "name": role,
+            "name": name,
             "showlegend": True,
             "hoverinfo": "name",
-            "color": WINNER if winner else BASELINE,
-            "opacity": 1.0 if winner else 0.3,
+            "color": colour,
+            "opacity": opacity,
             "flatshading": True,
             "lighting": {"ambient": 0.55, "diffuse": 0.7, "specular": 0.1},
         }
