@@ -7,12 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from softgym_envs.backends import hybrid_path
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.backends.registry import make_backend
 from softgym_envs.errors import InfeasibleDesign
-from softgym_envs.extensions.grasping.backends import hybrid_chain
-from softgym_envs.extensions.grasping.backends.chain_hand import ChainHand, ChainHandBackend, HandMemory
-from softgym_envs.extensions.grasping.backends.hybrid_chain import HybridHandBackend
+from softgym_envs.extensions.grasping.backends.chain_hand import (
+    ChainHand,
+    ChainHandBackend,
+    HandMemory,
+    HybridHandBackend,
+)
 from softgym_envs.robots.registry import make_robot
 from softgym_envs.surrogate.domain import OUTSIDE
 
@@ -186,7 +190,7 @@ def test_hybrid_hands_follow_with_finite_elements(monkeypatch):
             asked.append(command)
             return super().step(command, mode, force=force)
 
-    monkeypatch.setattr(hybrid_chain, "FEMBackend", Recorder)
+    monkeypatch.setattr(hybrid_path, "FEMBackend", Recorder)
     robot = make_robot("contact_aided_gripper")
     backend, alone = make_backend("hybrid", robot), hand(robot)
     assert isinstance(backend, HybridHandBackend) and backend.moving

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from softgym_envs.backends.backend import Backend, State, check_numbers, refuse_force
+from softgym_envs.backends.hybrid_path import PathHybridBackend
 from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 from softgym_envs.extensions.grasping.chain.contact import ChainBatch, ChainContacts, Memory, rows_for
@@ -229,3 +230,20 @@ class ChainBackend(Backend):
         if not isinstance(state.memory, Memory):
             raise ValueError("the state was not computed by a learned chain, which can only restore its own states")
         self.state = state
+
+
+class HybridChainBackend(PathHybridBackend):
+    """A learned chain where it is trusted, elsewhere finite elements.
+
+    The chain is not trusted for bodies outside its training, and where the finger would touch itself.
+
+    The arguments and errors are those of `ChainBackend`.
+    """
+
+    def __init__(
+        self,
+        robot: ContactAidedFinger,
+        design: Mapping[str, float] | None = None,
+        weights: str | Path | None = None,
+    ) -> None:
+        self._start(robot, ChainBackend(robot, design, weights))

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from softgym_envs.backends.backend import Backend, State, check_numbers, refuse_force
+from softgym_envs.backends.hybrid_path import PathHybridBackend
 from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 from softgym_envs.extensions.grasping.chain.contact import FOLDED, STICK, STIFFNESS
@@ -513,3 +514,25 @@ class ChainHandBackend(Backend):
             contacts=hand.contacts(),
             memory=memory,
         )
+
+
+class HybridHandBackend(PathHybridBackend):
+    """A hand of two learned fingers with a free box where it is trusted, elsewhere finite elements in motion.
+
+    A step of finite elements is one implicit time step with the damping of `FEMBackend`.
+
+    The arguments and errors are those of `ChainHandBackend`.
+    """
+
+    moving = True
+
+    def __init__(
+        self,
+        robot: ContactAidedGripper,
+        design: Mapping[str, float] | None = None,
+        weights: str | Path | None = None,
+        control_step: float = 0.05,
+    ) -> None:
+        self.control_step = control_step
+        learned = ChainHandBackend(robot, design, weights, control_step)
+        self._start(robot, learned, dynamics=True, control_step=control_step, time_step=control_step)

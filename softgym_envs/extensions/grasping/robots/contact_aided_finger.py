@@ -76,7 +76,7 @@ class ContactAidedFinger(GmshRobot):
     learning = Learning(stiffness_variable="young_modulus", convex=False)
     backends = {
         "surrogate": "softgym_envs.extensions.grasping.backends.chain:ChainBackend",
-        "hybrid": "softgym_envs.extensions.grasping.backends.hybrid_chain:HybridChainBackend",
+        "hybrid": "softgym_envs.extensions.grasping.backends.chain:HybridChainBackend",
     }
     may_touch = True  # `evaluate_grasp` adds the object
     meshes = {

@@ -125,7 +125,7 @@ class ContactAidedGripper(Robot):
     lifting = Lifting(drive=2, mass="object_mass", friction="friction")
     backends = {
         "surrogate": "softgym_envs.extensions.grasping.backends.chain_hand:ChainHandBackend",
-        "hybrid": "softgym_envs.extensions.grasping.backends.hybrid_chain:HybridHandBackend",
+        "hybrid": "softgym_envs.extensions.grasping.backends.chain_hand:HybridHandBackend",
     }
     goal_axes = np.array([0.0, 0.0, 1.0])
     goal_tolerance = 1.0e-3
