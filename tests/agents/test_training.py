@@ -433,6 +433,7 @@ def test_goals_repeat_and_belong_to_the_body():
         "quadruped_walk_gait",
         "quadruped_walk_winner",
         "quadruped_follow_horizon",
+        "quadruped_climb_horizon",
     ],
 )
 def test_shipped_policies_were_made_by_the_shipped_configs(name):
