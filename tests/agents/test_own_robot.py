@@ -16,11 +16,11 @@ from softgym_envs.errors import ConfigError
 from softgym_envs.robots.soft_finger import SoftFinger
 
 MODULE = """
-from softgym_envs import testing
+from tests import helpers
 from softgym_envs.envs.tasks.reach import Reach
 
 
-class Spike(testing.Spike):
+class Spike(helpers.Spike):
     pass
 
 
