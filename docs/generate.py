@@ -96,12 +96,13 @@ def robot_list() -> str:
 
 ROOT = DOCS.parent
 OUTSIDE = ("studies", "benchmarks")
-"""Folders beside the documentation whose pages and pictures are part of the site."""
+"""Folders beside the documentation whose pages, pictures and results are part of the site."""
 
 
 def study_files() -> list[Path]:
-    """Return the pages and pictures of the folders outside, relative to the root, the index of studies first."""
-    files = [path for folder in OUTSIDE for kind in ("md", "png", "svg") for path in (ROOT / folder).rglob(f"*.{kind}")]
+    """Return pages, pictures and results of the folders outside, relative to the root, the index of studies first."""
+    kinds = ("md", "png", "svg", "json")
+    files = [path for folder in OUTSIDE for kind in kinds for path in (ROOT / folder).rglob(f"*.{kind}")]
     return sorted(
         (path.relative_to(ROOT) for path in files), key=lambda path: (path != Path("studies/README.md"), path)
     )
