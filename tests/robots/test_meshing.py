@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from softgym_envs.errors import DataError, InfeasibleDesign, MeshingError
+from softgym_envs.mechanics import gmsh_process
 from softgym_envs.robots.geometry import meshing
 from softgym_envs.robots.geometry.finger_shape import draw_finger
 from softgym_envs.robots.geometry.meshing import BodyMesh, mesh_geometry
@@ -26,13 +27,13 @@ def cache(tmp_path, monkeypatch):
 @pytest.fixture
 def count_runs(monkeypatch):
     """Count how often gmsh is started."""
-    runs, run = [], meshing.subprocess.run
+    runs, run = [], gmsh_process.subprocess.run
 
     def counted(*args, **options):
         runs.append(1)
         return run(*args, **options)
 
-    monkeypatch.setattr(meshing.subprocess, "run", counted)
+    monkeypatch.setattr(gmsh_process.subprocess, "run", counted)
     return runs
 
 
@@ -115,9 +116,9 @@ def test_every_parameter_and_the_mesh_size_are_part_of_the_key(cache, monkeypatc
 
     def stop(command, **_):
         commands.append(command)
-        raise meshing.subprocess.TimeoutExpired(command, 0.0)
+        raise gmsh_process.subprocess.TimeoutExpired(command, 0.0)
 
-    monkeypatch.setattr(meshing.subprocess, "run", stop)
+    monkeypatch.setattr(gmsh_process.subprocess, "run", stop)
     mesh = BodyMesh(np.zeros((4, 3)), np.array([[0, 1, 2, 3]]), np.array([[0, 1, 2]]), np.array([1]))
     saved = []
     monkeypatch.setattr(BodyMesh, "load", classmethod(lambda cls, path: saved.append(path.name) or mesh))

@@ -11,6 +11,7 @@ import pytest
 
 from softgym_envs import make_robot
 from softgym_envs.errors import DesignError, InfeasibleDesign
+from softgym_envs.mechanics import gmsh_process
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots import ROBOTS
 from softgym_envs.robots.geometry import meshing
@@ -112,7 +113,7 @@ def test_baseline_meshes_are_shipped(robot, monkeypatch, tmp_path):
     def refuse(*_, **__):
         raise AssertionError("gmsh was called")
 
-    monkeypatch.setattr(meshing.subprocess, "run", refuse)
+    monkeypatch.setattr(gmsh_process.subprocess, "run", refuse)
     assert robot.mesh(robot.reference_design).origin == "meshed"
     assert not list(tmp_path.iterdir())
 

@@ -10,9 +10,9 @@ import pytest
 from softgym_envs import make_robot
 from softgym_envs.envs.plant import Plants
 from softgym_envs.errors import DesignError, InfeasibleDesign
+from softgym_envs.mechanics import gmsh_process
 from softgym_envs.mechanics.constraints.cavity import ATMOSPHERE, enclosed_volume
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.robots.geometry import meshing
 from softgym_envs.robots.geometry.finger_shape import check_finger
 from softgym_envs.robots.geometry.meshing import BodyMesh
 
@@ -53,7 +53,7 @@ def test_baseline_meshes_are_shipped(robot, monkeypatch, tmp_path):
     def refuse(*_, **__):
         raise AssertionError("gmsh was called")
 
-    monkeypatch.setattr(meshing.subprocess, "run", refuse)
+    monkeypatch.setattr(gmsh_process.subprocess, "run", refuse)
     assert 500 < len(robot.body().nodes) < 800
     assert not list(tmp_path.iterdir())
 
@@ -219,7 +219,7 @@ def test_closed_formulas_detect_infeasible_shapes_without_meshing(robot, monkeyp
     def refuse(*_, **__):
         raise AssertionError("gmsh was called")
 
-    monkeypatch.setattr(meshing.subprocess, "run", refuse)
+    monkeypatch.setattr(gmsh_process.subprocess, "run", refuse)
     for verb in (robot.body, robot.build, robot.readings):
         with pytest.raises(InfeasibleDesign, match=message):
             verb(design)
