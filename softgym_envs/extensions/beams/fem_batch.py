@@ -12,8 +12,8 @@ from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 from softgym_envs.extensions.beams.solver.batch import BeamBatch, BeamStates
-from softgym_envs.extensions.beams.solver.contact import ContactPoints
 from softgym_envs.extensions.beams.solver.motion import BeamMotion, anchors_of, memory_of
+from softgym_envs.extensions.beams.solver.points import ContactPoints
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.contact.contact import ContactMemory
 from softgym_envs.mechanics.elements.beams import are_folded

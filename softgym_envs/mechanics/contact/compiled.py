@@ -52,7 +52,7 @@ def table_of(obstacles: Sequence[Obstacle]) -> tuple[np.ndarray, np.ndarray]:
     return table, edges
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def quick_gap(p, parameters, edges):
     """Return the gap [m] of a point (3,) to an obstacle, without its derivatives."""
     kind = int(parameters[0])
@@ -64,23 +64,44 @@ def quick_gap(p, parameters, edges):
         for i in range(3):
             square += (parameters[8 + 3 * i] * x + parameters[9 + 3 * i] * y + parameters[10 + 3 * i] * z) ** 2
         return max(math.sqrt(square), 1e-300) - parameters[2]
-    normal, curvature = np.empty(3), np.empty((3, 3))
-    return gap_of(p, parameters, edges, normal, curvature)
+    return _gap_of_prism(p, parameters, edges)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=True)
+def _gap_of_prism(p, parameters, edges):
+    """Return the gap [m] of a point (3,) to a prism."""
+    return _prism(p, parameters, edges, np.empty(3), np.empty((3, 3)))
+
+
+@njit(cache=True, error_model="numpy", _nrt=True)
+def _prism(p, parameters, edges, normal, curvature):
+    """Do what `gap_of` says for a prism."""
+    count, matrix = int(parameters[4]), parameters[8:17].reshape(3, 3)
+    local = np.empty((1, 3))
+    local[0] = (p - parameters[5:8]) @ matrix
+    found, n, h = np.empty(1), np.empty((1, 3)), np.empty((1, 3, 3))
+    prism_geometry(
+        local, edges[:count, 0:2], edges[:count, 2], edges[:count, 3:5], edges[:count, 5:7], parameters[3],
+        parameters[2], found, n, h,
+    )  # fmt: skip
+    normal[:] = matrix @ n[0]
+    curvature[:, :] = matrix @ h[0] @ matrix.T
+    return found[0]
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
 def gap_of(p, parameters, edges, normal, curvature):
     """Return the gap [m] of a point (3,) to an obstacle; fill its normal (3,) and curvature (3, 3)."""
     kind = int(parameters[0])
-    matrix = parameters[8:17].reshape(3, 3)
     if kind == PLANE:
         gap = 0.0
         for i in range(3):
-            normal[i] = matrix[0, i]
+            normal[i] = parameters[8 + i]
             gap += normal[i] * (p[i] - parameters[5 + i])
             for j in range(3):
                 curvature[i, j] = 0.0
         return gap
+    matrix = parameters[8:17].reshape(3, 3)
     if kind == ROUND:
         x, y, z = p[0] - parameters[5], p[1] - parameters[6], p[2] - parameters[7]
         square = 0.0
@@ -94,17 +115,7 @@ def gap_of(p, parameters, edges, normal, curvature):
             for j in range(3):
                 curvature[i, j] = (matrix[i, j] - normal[i] * normal[j]) / length
         return length - parameters[2]
-    count = int(parameters[4])
-    local = np.empty((1, 3))
-    local[0] = (p - parameters[5:8]) @ matrix
-    found, n, h = np.empty(1), np.empty((1, 3)), np.empty((1, 3, 3))
-    prism_geometry(
-        local, edges[:count, 0:2], edges[:count, 2], edges[:count, 3:5], edges[:count, 5:7], parameters[3],
-        parameters[2], found, n, h,
-    )  # fmt: skip
-    normal[:] = matrix @ n[0]
-    curvature[:, :] = matrix @ h[0] @ matrix.T
-    return found[0]
+    return _prism(p, parameters, edges, normal, curvature)
 
 
 class PointTouch(NamedTuple):
@@ -139,14 +150,14 @@ def make_touch():
     return PointTouch(w[0], w[1:4], w[4], w[5], w[6], w[7:10], w[10], w[11:14])
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def barrier_value(gap, distance):
     """Return the energy of a barrier per area and stiffness [m]; see `law.barrier`."""
     s = (gap / distance) ** 2
     return -distance * (s - 1.0) ** 2 * math.log(s)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def barrier_slope(gap, distance):
     """Return the derivative of `barrier_value` by the gap."""
     s = (gap / distance) ** 2
@@ -154,7 +165,7 @@ def barrier_slope(gap, distance):
     return -2.0 * gap / distance * (2.0 * rest * math.log(s) + rest * rest / s)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def barrier_curvature(gap, distance):
     """Return the second derivative of `barrier_value` by the gap [1/m]."""
     s = (gap / distance) ** 2
@@ -163,7 +174,7 @@ def barrier_curvature(gap, distance):
     return -(4.0 * s * (2.0 * log + 4.0 * rest / s - rest * rest / (s * s)) + 2.0 * by_s) / distance
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def stretch_of(p, obstacle, edges, anchor, out):
     """Fill ``out.direction`` with the stretch of a friction spring along the surface [m]; return its length [m]."""
     along, place = out.direction, out.place
@@ -177,7 +188,7 @@ def stretch_of(p, obstacle, edges, anchor, out):
     return math.sqrt(square)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def add_friction(p, obstacle, edges, anchor, spring, limit, out):
     """Add the friction of a spring [N/m] whose limit [N] is held to pull and tangent; its energy [J] and if it slides.
 
@@ -202,7 +213,7 @@ def add_friction(p, obstacle, edges, anchor, spring, limit, out):
     return (limit * size - 0.5 * limit * limit / spring if sliding else 0.5 * spring * size * size), sliding
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def touch_point(p, area, obstacle, edges, anchor, law, convex, out):
     """Fill what one obstacle does to a point that is nearer than the distance of contact, and outside.
 

@@ -9,10 +9,67 @@ Sums run in local variables and may be reordered and fused, which compilers then
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
+import numpy as np
+
 from softgym_envs.mechanics.compilation import FAST, njit
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+class Work(NamedTuple):
+    """Work arrays of the assembly, for one element, chamber or pair of frames at a time.
+
+    Attributes:
+        z: axis and directors at two Gauss points with their slopes, shape (2, 7, 3).
+        pull: what a Gauss point does to them, shape (7, 3).
+        stress: shape (2, 6).
+        stiffness: shape (2, 6).
+        spins: strains by spins of frames, shape (3, 2, 6, 3).
+        crossed: displacements by spins, shape (3, 2, 3, 3).
+        straight: displacements by displacements, shape (2, 3, 3).
+        moments: of two frames on each other, zero on the diagonal, shape (3, 3).
+        matrix: shape (3, 3).
+        block: of the tangent, shape (6, 6).
+        way: shape (3,).
+        slope: shape (3,).
+        motion: of the tangent of a chamber by three frames, shape (3, 18).
+    """
+
+    z: np.ndarray
+    pull: np.ndarray
+    stress: np.ndarray
+    stiffness: np.ndarray
+    spins: np.ndarray
+    crossed: np.ndarray
+    straight: np.ndarray
+    moments: np.ndarray
+    matrix: np.ndarray
+    block: np.ndarray
+    way: np.ndarray
+    slope: np.ndarray
+    motion: np.ndarray
+
+
+def make_work() -> Work:
+    """Return work arrays."""
+    return Work(
+        z=np.zeros((2, 7, 3)),
+        pull=np.zeros((7, 3)),
+        stress=np.zeros((2, 6)),
+        stiffness=np.zeros((2, 6)),
+        spins=np.zeros((3, 2, 6, 3)),
+        crossed=np.zeros((3, 2, 3, 3)),
+        straight=np.zeros((2, 3, 3)),
+        moments=np.zeros((3, 3)),
+        matrix=np.zeros((3, 3)),
+        block=np.zeros((6, 6)),
+        way=np.zeros(3),
+        slope=np.zeros(3),
+        motion=np.zeros((3, 3 * 6)),
+    )
+
+
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
 def interpolate(x, rows, shape, slope, z):
     """Fill ``z`` at rows ``x`` (n, 3); elements have two or three frames."""
     last = rows.shape[0] - 1
@@ -30,7 +87,7 @@ def interpolate(x, rows, shape, slope, z):
             z[3 + m, d] = p * u + q * v + r * w
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
 def strains(z, out):
     """Fill ``out`` (6,) with the strains, those at rest included."""
     a, b, c, p, q, r = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -44,7 +101,7 @@ def strains(z, out):
     out[0], out[1], out[2], out[3], out[4], out[5] = a, b, c, 0.5 * p, 0.5 * q, 0.5 * r
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
 def pull_back(z, stress, gradient):
     """Add to ``gradient`` (7, 3) the derivative by ``z`` of the work that ``stress`` (6,) does on the strains."""
     f, g, h = stress[0], stress[1], stress[2]
@@ -60,7 +117,7 @@ def pull_back(z, stress, gradient):
         gradient[6, d] += q * a - p * b
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
 def add_forces(gradient, rows, shape, slope, out):
     """Add the derivative by the rows to ``out`` (n, 3), given that by ``z``, ``gradient`` (7, 3)."""
     for f in range(rows.shape[0]):
@@ -72,7 +129,7 @@ def add_forces(gradient, rows, shape, slope, out):
             out[row + 3, d] += h * gradient[3, d] + s * gradient[6, d]
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
 def spin_columns(x, row, h, s, z, out):
     """Fill ``out`` (6, 3) with derivatives of the strains by the spin of a frame, which turns its directors in ``x``.
 
@@ -102,7 +159,7 @@ def spin_columns(x, row, h, s, z, out):
     out[5, 2] = 0.5 * (a0 * u - a1 * t - b0 * q + b1 * p)
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
 def displacement_by_spin(z, stiffness, spin, row, h, stress, x, out):
     """Fill ``out`` (3, 3) with the tangent of a displacement by the spin of a frame, per slope of the displaced one.
 
@@ -134,7 +191,7 @@ def displacement_by_spin(z, stiffness, spin, row, h, stress, x, out):
     out[2, 1] -= p
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
 def spin_by_spin(first, second, stiffness, block):
     """Fill the part (3, 3) of a block that belongs to both spins with the terms of the stiffness.
 
@@ -160,7 +217,7 @@ def spin_by_spin(first, second, stiffness, block):
     block[5, 3], block[5, 4], block[5, 5] = t, u, v
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
 def add_turned(x, one, other, m, block):
     """Add the second derivative of ``sum_ij m_ij (w x p_i) . (v x q_j)`` by two spins to a block (6, 6).
 

@@ -7,7 +7,7 @@ import numpy as np
 from softgym_envs.mechanics.compilation import njit
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def _with_slack(slack, W, gap, unilateral, tolerance, y, a, index):
     """Fill y (m,) with the efforts, assuming that the actuators in ``slack`` carry none.
 
@@ -51,7 +51,7 @@ def _with_slack(slack, W, gap, unilateral, tolerance, y, a, index):
     return wrong
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def solve_row(W, gap, unilateral, y, a, index):
     """Fill y (m,) with the consistent efforts; False if there are none.
 

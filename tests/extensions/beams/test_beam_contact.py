@@ -7,7 +7,10 @@ import math
 import numpy as np
 import pytest
 
+from softgym_envs import make_robot
+from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.extensions.beams.solver.batch import BeamBatch, BeamStates
+from softgym_envs.extensions.beams.solver.contact import FEW
 from softgym_envs.extensions.beams.solver.equations import Step, assemble, point_strains
 from softgym_envs.extensions.beams.solver.frames import move
 from softgym_envs.extensions.beams.solver.motion import anchors_of
@@ -17,7 +20,7 @@ from softgym_envs.mechanics.contact.obstacles import Cylinder, MeshObstacle, Pla
 from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.solvers.dynamics import Dynamics
 from softgym_envs.mechanics.solvers.statics import Statics
-from tests.verification.walkers import H, compared_walk, dynamics, ground, trot, walker
+from tests.verification.walkers import H, compared_walk, dynamics, ground, mover, remaining, trot, walker
 
 
 def tilted(angle):
@@ -89,15 +92,35 @@ def test_steps_of_a_walk_are_those_of_the_general_solver(standing):
     assert sliding > 5
 
 
-@pytest.mark.parametrize("seed", [0, 4, 6, 17])
+@pytest.mark.parametrize("seed", [0, 4, 6, 14, 17])
 def test_random_walks_take_whole_steps_that_solve_the_general_equations(seed):
-    """Of twenty random bodies and gaits, these four pass most often between sticking and sliding."""
+    """Of twenty random bodies and gaits, these pass most often between sticking and sliding; 14 does so in step 11."""
     found = compared_walk(seed)
     assert (found.steps, found.divided, found.compared) == (200, 0, 20)
     assert found.correction < 1e-9
     assert found.compliance < 1e-6
     assert found.touching > 20
     assert found.sliding > 5
+
+
+def test_a_body_that_lies_on_many_points_solves_the_general_equations():
+    """A crawler that is put down on its belly, and lifts itself: more points touch than have a dense compliance."""
+    backend = FEMBackend(make_robot("crawler"), dynamics=True)
+    solver, general = mover(backend), mover(backend, compiled=False)
+    goal = 0.2 * np.asarray(backend.robot.upper)
+    counts, sliding = [], 0
+    for k in range(30):
+        start = solver.x, solver.effort, solver.velocity, solver.memory
+        command = min(1.0, k / 20) * goal
+        taken, found = solver.advance_compiled(command[None])
+        assert (taken, found.substeps) == (1, 1)
+        counts.append(found.equilibrium.contacts.count)
+        sliding += int(found.equilibrium.contacts.sliding.sum())
+        if k % 5 == 0:
+            assert remaining(general, start, found.equilibrium.x, found.equilibrium.effort, command)[0] < 1e-9
+    assert max(counts) > 4 * FEW
+    assert min(counts) <= FEW
+    assert sliding > 0
 
 
 def test_steps_between_other_obstacles_are_those_of_the_general_solver():

@@ -10,7 +10,7 @@ import pytest
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.extensions.beams.robots.stiff_flop import StiffFlop
 from softgym_envs.extensions.beams.robots.tetrapod import Tetrapod
-from softgym_envs.extensions.beams.solver import block_cholesky
+from softgym_envs.extensions.beams.solver import block_cholesky, block_elimination
 from softgym_envs.extensions.beams.solver.body import is_beam_body
 from softgym_envs.extensions.beams.solver.equations import Step, assemble, point_strains
 from softgym_envs.extensions.beams.solver.frames import motion_of, move
@@ -99,6 +99,30 @@ def test_block_factors_solve_like_dense_ones(rng, shift):
     assert solution[place].ravel() == pytest.approx(np.linalg.solve(dense, right.ravel()), rel=1e-9, abs=1e-11)
     values[0] = 0.0
     assert block_cholesky.factorise(values, pattern.pointers, pattern.targets, signs) == -1
+
+
+def test_blocks_that_are_not_symmetric_solve_like_dense_ones(rng):
+    count = 9
+    pairs = [(i, j) for i in range(count) for j in range(i) if rng.random() < 0.3]
+    _, pattern = block_cholesky.analyse(count, pairs)
+    dense = np.zeros((count, 6, count, 6))
+    for i in range(count):
+        dense[i, :, i] = 15.0 * np.eye(6) + rng.normal(size=(6, 6))
+        for j in pattern.columns[pattern.pointers[i] : pattern.pointers[i + 1]]:
+            dense[i, :, j], dense[j, :, i] = rng.normal(size=(2, 6, 6))
+    upper, lower = np.zeros((pattern.blocks, 6, 6)), np.zeros((len(pattern.columns), 6, 6))
+    for i in range(count):
+        upper[i] = dense[i, :, i]
+        for p in range(pattern.pointers[i], pattern.pointers[i + 1]):
+            upper[count + p], lower[p] = dense[i, :, pattern.columns[p]], dense[pattern.columns[p], :, i]
+    right = rng.normal(size=(count, 6))
+    solution = right.copy()
+    assert block_elimination.eliminate_blocks(upper, lower, pattern.pointers, pattern.targets, np.zeros(6))
+    block_elimination.solve_blocks(upper, lower, pattern.pointers, pattern.columns, solution)
+    expected = np.linalg.solve(dense.reshape(54, 54), right.ravel())
+    assert solution.ravel() == pytest.approx(expected, rel=1e-9, abs=1e-11)
+    upper[0] = 0.0
+    assert not block_elimination.eliminate_blocks(upper, lower, pattern.pointers, pattern.targets, np.zeros(6))
 
 
 def compare_equations(model, found, body, equations):

@@ -142,7 +142,7 @@ def record(system, strains, state, targets, drive, stepping, tape):
     return count
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
 def _strains_along(z, w, out):
     """Fill ``out`` (6,) with the derivative of the strains at a state ``z`` along ``w``, both (7, 3)."""
     a, b, c, p, q, r = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -200,7 +200,7 @@ def _add_resistance(elements, x, y, moved, rate, out):
                     out[frames[k], i] += shape[k] * back - slope[k] * turned
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def _friction_derivatives(p, area, obstacle, edges, anchor, law, touch, by_point, by_anchor):
     """Fill the derivatives (3, 3) of minus the friction force on a touching point by the point and by its anchor."""
     _, _, _, pressing, sliding = touch_point(p, area, obstacle, edges, anchor, law, True, touch)
@@ -299,9 +299,9 @@ def _friction_back(contact, slides, y, anchors, moved, by_anchors):
                         by_anchors[o, k, i] -= by_anchor[j, i] * q[j]
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
 def _slide_back(slides, y, signs):
-    """Do for the transposed tangent what `beam_contact.slide` does for the tangent."""
+    """Do for the transposed tangent what `contact.slide` does for the tangent."""
     if slides is None:
         return
     count, size = slides.number[0], y.size

@@ -21,10 +21,10 @@ from softgym_envs.extensions.beams.solver.body import (
     Rows,
     Servos,
 )
-from softgym_envs.extensions.beams.solver.contact import ContactPoints
 from softgym_envs.extensions.beams.solver.equations import Equations
 from softgym_envs.extensions.beams.solver.motion import BeamState, Stepping, march
 from softgym_envs.extensions.beams.solver.newton import Factor, System, make_system
+from softgym_envs.extensions.beams.solver.points import ContactPoints
 from softgym_envs.mechanics.compilation import njit
 
 
@@ -203,6 +203,7 @@ def _points(c, k):
     """Return the points of body ``k``."""
     return ContactPoints(
         c.groups[k],
+        c.rows[k],
         c.frames[k],
         c.blocks[k],
         c.place[k],
@@ -256,6 +257,7 @@ def _march_all(
                 equations.H,
                 equations.energy,
                 equations.slides,
+                equations.work,
             )
             f = Factor(
                 states.half[k],
@@ -265,6 +267,7 @@ def _march_all(
                 states.signs[k],
                 factor.step,
                 factor.efforts,
+                factor.gap,
                 factor.turned,
             )
             f.compliance[:] = states.compliance[k]

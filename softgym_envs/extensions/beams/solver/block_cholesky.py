@@ -85,7 +85,15 @@ def analyse(count: int, pairs: Iterable[tuple[int, int]]) -> tuple[np.ndarray, B
     return place, pattern._replace(targets=np.array(targets, dtype=np.int64))
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, error_model="numpy", _nrt=False)
+def copy_values(source, out):
+    """Fill an array with the values of another one of its shape, which kernels without references cannot assign."""
+    flat, given = out.reshape(out.size), source.reshape(source.size)
+    for i in range(flat.shape[0]):
+        flat[i] = given[i]
+
+
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
 def _invert_factor(D, diagonal, sign, negative):
     """Replace a block by the inverse of its factor (lower triangle), and fill the signs (6,) of its pivots.
 
@@ -121,15 +129,20 @@ def _invert_factor(D, diagonal, sign, negative):
     return negative
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@njit(cache=True, error_model="numpy", _nrt=True)
 def factorise(A, pointers, targets, signs):
     """Factorise a matrix in place and fill the signs (b, 6) of the pivots; diagonal blocks become inverses of factors.
 
     Returns the number of negative pivots, that of negative eigenvalues; or -1 if elimination without pivoting breaks
     down.
     """
+    return _eliminate(A, pointers, targets, signs, np.empty((SIZE, SIZE)), np.empty(signs.shape))
+
+
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath={"contract"})
+def _eliminate(A, pointers, targets, signs, signed, diagonal):
+    """Do what `factorise` says; ``signed`` (6, 6) and ``diagonal`` (b, 6) are work arrays."""
     count, t, negative = pointers.shape[0] - 1, 0, 0
-    signed, diagonal = np.empty((SIZE, SIZE)), np.empty((count, SIZE))
     for k in range(count):
         for i in range(SIZE):
             diagonal[k, i] = A[k, i, i]
@@ -170,7 +183,7 @@ def factorise(A, pointers, targets, signs):
     return negative
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
 def solve_lower(A, pointers, columns, y):
     """Solve with the lower factor ``U^T`` in place, for one vector ``y`` (b, 6). Leading zeros are passed over.
 
@@ -195,21 +208,18 @@ def solve_lower(A, pointers, columns, y):
                 y[row, j] -= B[0, j] * a + B[1, j] * b + B[2, j] * c + B[3, j] * d + B[4, j] * e + B[5, j] * f
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
 def solve_upper(A, pointers, columns, y):
     """Solve with the upper factor ``U`` in place, for one vector ``y`` (b, 6)."""
     count = pointers.shape[0] - 1
-    v = np.empty(SIZE)
     for k in range(count - 1, -1, -1):
-        for i in range(SIZE):
-            v[i] = y[k, i]
         for p in range(pointers[k], pointers[k + 1]):
             B, row = A[count + p], columns[p]
             a, b, c, d, e, f = y[row, 0], y[row, 1], y[row, 2], y[row, 3], y[row, 4], y[row, 5]
             for i in range(SIZE):
-                v[i] -= B[i, 0] * a + B[i, 1] * b + B[i, 2] * c + B[i, 3] * d + B[i, 4] * e + B[i, 5] * f
+                y[k, i] -= B[i, 0] * a + B[i, 1] * b + B[i, 2] * c + B[i, 3] * d + B[i, 4] * e + B[i, 5] * f
         D = A[k]
-        a, b, c, d, e, f = v[0], v[1], v[2], v[3], v[4], v[5]
+        a, b, c, d, e, f = y[k, 0], y[k, 1], y[k, 2], y[k, 3], y[k, 4], y[k, 5]
         y[k, 0] = D[0, 0] * a + D[1, 0] * b + D[2, 0] * c + D[3, 0] * d + D[4, 0] * e + D[5, 0] * f
         y[k, 1] = D[1, 1] * b + D[2, 1] * c + D[3, 1] * d + D[4, 1] * e + D[5, 1] * f
         y[k, 2] = D[2, 2] * c + D[3, 2] * d + D[4, 2] * e + D[5, 2] * f

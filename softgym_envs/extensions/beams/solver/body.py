@@ -1,4 +1,4 @@
-"""Bodies of beams and rigid parts as plain arrays, for the compiled equations of `beam_equations`."""
+"""Bodies of beams and rigid parts as plain arrays, for the compiled equations of `equations`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from scipy.sparse import csr_matrix
 
 from softgym_envs.extensions.beams.solver.block_cholesky import SIZE, BlockPattern, analyse
-from softgym_envs.extensions.beams.solver.contact import ContactPoints, contact_points, reason_against
+from softgym_envs.extensions.beams.solver.points import ContactPoints, contact_points, reason_against
 from softgym_envs.mechanics.assembly import MassMatrix
 from softgym_envs.mechanics.constraints.chamber import Chamber
 from softgym_envs.mechanics.constraints.point import Point

@@ -99,7 +99,7 @@ def _flat(parts: Any) -> list[Any]:
     return sum((_flat(part) for part in parts), []) if isinstance(parts, tuple) else [parts]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def _placed(body, x, nodes, own, out):
     """Fill ``out`` (n, 3) with the rows of another body whose movable frames are where rows ``x`` (n, 3) have them.
 
@@ -131,7 +131,7 @@ def _placed(body, x, nodes, own, out):
     _follow(body.frames, out)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def _follow(frames, rows):
     """Let rows of places or velocities (n, 3) that follow a frame do so."""
     for c in range(frames.mounted.shape[0]):
@@ -170,7 +170,7 @@ def _anchor_work(contact, slides, x, anchors, by_anchors):
     return value
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def _start_work(contact, slides, x, by_anchors):
     """Return the product of ``by_anchors`` with relaxed anchors at rows ``x``."""
     value = 0.0

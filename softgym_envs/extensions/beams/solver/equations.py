@@ -12,14 +12,16 @@ import numpy as np
 
 from softgym_envs.extensions.beams.solver.block_cholesky import SIZE
 from softgym_envs.extensions.beams.solver.body import DIRECTOR, FIXED, ORIGIN, BeamBody
-from softgym_envs.extensions.beams.solver.contact import Slides, add_contact, hold_slides, make_slides
+from softgym_envs.extensions.beams.solver.contact import Slides, add_contact, forget_near, hold_slides, make_slides
 from softgym_envs.extensions.beams.solver.frames import add_curvature, reduce_forces
 from softgym_envs.mechanics.compilation import FAST, njit
 from softgym_envs.mechanics.elements.beam_kernels import (
+    Work,
     add_forces,
     add_turned,
     displacement_by_spin,
     interpolate,
+    make_work,
     pull_back,
     spin_by_spin,
     spin_columns,
@@ -63,6 +65,7 @@ class Equations(NamedTuple):
         H: their gradients, shape (size, b, 6).
         energy: elastic energy [J], shape (1,).
         slides: terms of sliding points; None for a body that touches nothing.
+        work: work arrays.
     """
 
     gradient: np.ndarray
@@ -73,6 +76,7 @@ class Equations(NamedTuple):
     H: np.ndarray
     energy: np.ndarray
     slides: Slides | None
+    work: Work
 
 
 def make_equations(body: BeamBody, size: int) -> Equations:
@@ -86,24 +90,30 @@ def make_equations(body: BeamBody, size: int) -> Equations:
         delta=np.zeros(size),
         H=np.zeros((size, count, SIZE)),
         energy=np.zeros(1),
-        slides=make_slides(body.contact, count, size),
+        slides=make_slides(body.contact, count, size, n, body.pattern.blocks),
+        work=make_work(),
     )
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy")
 def point_strains(elements, x, out):
     """Fill ``out`` (m, 2, 6) with the strains at the Gauss points, those at rest included, at rows ``x`` (n, 3)."""
-    z = np.empty((7, 3))
+    _fill_strains(elements, x, out, np.empty((7, 3)))
+
+
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
+def _fill_strains(elements, x, out, z):
+    """Do what `point_strains` says; ``z`` is a work array."""
     for e in range(elements.frames.shape[0]):
         for q in range(2):
             interpolate(x, elements.frames[e], elements.shape[q], elements.slope[e, q], z)
             strains(z, out[e, q])
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
-def strain_work(elements, x, step):
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
+def strain_work(elements, x, step, arrays):
     """Return the elastic energy at rows ``x`` (n, 3), and the work that damping takes on the way there [J]."""
-    z, end = np.empty((7, 3)), np.empty(6)
+    z, end = arrays.z[0], arrays.stress[0]
     elastic, work = 0.0, 0.0
     for e in range(elements.frames.shape[0]):
         for q in range(2):
@@ -116,7 +126,7 @@ def strain_work(elements, x, step):
     return elastic, step.stiffness_damping / step.h * work
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
 def resistance(elements, e, q, x, out):
     """Fill ``out`` (3, 3) with the resistance of the fluid at a Gauss point [N s/m] at rows ``x`` (n, 3).
 
@@ -134,7 +144,7 @@ def resistance(elements, e, q, x, out):
     out[2, 0], out[2, 1], out[2, 2] = out[0, 2], out[1, 2], across + factor * s * s
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
 def between(elements, e, q, start, end, out):
     """Fill ``out`` (3,) with the way of the axis at a Gauss point between rows ``start`` and ``end`` (n, 3) [m]."""
     i, j, k = elements.frames[e]
@@ -143,10 +153,10 @@ def between(elements, e, q, start, end, out):
         out[d] = a * (end[i, d] - start[i, d]) + b * (end[j, d] - start[j, d]) + c * (end[k, d] - start[k, d])
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
-def drag_work(elements, x, step):
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
+def drag_work(elements, x, step, arrays):
     """Return the work [J] that the fluid takes on the way from the start of a step to rows ``x`` (n, 3)."""
-    D, way, work = np.empty((3, 3)), np.empty(3), 0.0
+    D, way, work = arrays.matrix, arrays.way, 0.0
     for e in range(elements.drag.shape[0]):
         for q in range(2):
             resistance(elements, e, q, step.x, D)
@@ -157,13 +167,13 @@ def drag_work(elements, x, step):
     return work / step.h
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
 def _add_drag(elements, x, step, equations, full):
     """Add the resistance of the fluid to the motion from the start of the step, with the axis as it was there."""
     rate = 1.0 / step.h
     if rate == 0.0 or elements.drag.shape[0] == 0:
         return
-    D, way, block = np.empty((3, 3)), np.empty(3), np.empty((6, 6))
+    D, way, block = equations.work.matrix, equations.work.way, equations.work.block
     for e in range(elements.drag.shape[0]):
         frames, mount, place = elements.frames[e], elements.mount[e], elements.place[e]
         for q in range(2):
@@ -194,7 +204,7 @@ def _add_drag(elements, x, step, equations, full):
                             target[i, j] += block[i, j]
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
 def _add_arms(x, own, mounted, block, transposed):
     """Let the first frame of a block (6, 6) of the tangent follow the frame on which it is mounted, or the second one.
 
@@ -214,14 +224,15 @@ def _add_arms(x, own, mounted, block, transposed):
             block[5, c] += p * v - q * u
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST, inline="always")
-def _add_tangent(elements, e, x, z, stress, rate, work, tangent):
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
+def _add_tangent(elements, e, x, rate, work, tangent):
     """Add the tangent of an element to its blocks.
 
     Terms of single frames, the curvature of their rotation, are left out: all forces on a frame contribute to them.
-    ``z`` (2, 7, 3) and ``stress`` (2, 6) are those of its Gauss points. ``work`` are work arrays.
+    ``work`` holds what is known at its Gauss points.
     """
-    stiffness, spins, crossed, straight, moments, block = work
+    z, stress, stiffness, spins, crossed = work.z, work.stress, work.stiffness, work.spins, work.crossed
+    straight, moments, block = work.straight, work.moments, work.block
     frames, shapes, slopes = elements.frames[e], elements.shape, elements.slope[e]
     mount, place = elements.mount[e], elements.place[e]
     for q in range(2):
@@ -272,20 +283,12 @@ def _add_tangent(elements, e, x, z, stress, rate, work, tangent):
                         target[i, j] += block[j, i]
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
 def _add_elements(elements, x, step, equations, full):
     """Add the forces of the elements and, if ``full``, their tangents."""
     frames_of, shapes, slopes = elements.frames, elements.shape, elements.slope
-    z, pull, stress = np.empty((2, 7, 3)), np.empty((7, 3)), np.empty((2, 6))
-    moments = np.zeros((3, 3))
-    work = (
-        np.empty((2, 6)),
-        np.empty((3, 2, 6, 3)),
-        np.empty((3, 2, 3, 3)),
-        np.empty((2, 3, 3)),
-        moments,
-        np.empty((6, 6)),
-    )
+    work = equations.work
+    z, pull, stress = work.z, work.pull, work.stress
     rate = step.stiffness_damping / step.h
     elastic = 0.0
     for e in range(frames_of.shape[0]):
@@ -309,11 +312,11 @@ def _add_elements(elements, x, step, equations, full):
             pull_back(z[q], tension, pull)
             add_forces(pull, frames, shapes[q], slopes[e, q], equations.gradient)
         if full:
-            _add_tangent(elements, e, x, z, stress, rate, work, equations.tangent)
+            _add_tangent(elements, e, x, rate, work, equations.tangent)
     equations.energy[0] = elastic
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
 def multiply_mass(masses, rows, out):
     """Add ``M rows`` to ``out``, both (n, 3)."""
     pointers, columns, values = masses.pointers, masses.columns, masses.values
@@ -329,7 +332,7 @@ def multiply_mass(masses, rows, out):
         out[i, 2] += c
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def _vector(rows, x, row, out):
     """Fill ``out`` (3,) with the part of a row that turns with its frame; return whether the origin moves the row."""
     kind = rows.kind[row]
@@ -338,7 +341,7 @@ def _vector(rows, x, row, out):
     return kind != DIRECTOR
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
 def _add_inertia(masses, x, step, equations, full):
     """Add the forces of inertia and of mass damping and, if ``full``, their tangents."""
     rate = 1.0 / step.h
@@ -351,7 +354,7 @@ def _add_inertia(masses, x, step, equations, full):
     multiply_mass(masses, momentum, equations.gradient)
     if not full or factor == 0.0:
         return
-    m = np.empty((3, 3))
+    m = equations.work.matrix
     for k in range(masses.pairs.shape[0]):
         one, other, block = masses.pairs[k, 0], masses.pairs[k, 1], equations.tangent[masses.pairs[k, 2]]
         entries = masses.entries[k]
@@ -373,12 +376,12 @@ def _add_inertia(masses, x, step, equations, full):
             block[3 + j, n] -= factor * r
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def add_constraints(body, x, effort, equations, full):
     """Fill the values of the constraints, and subtract the forces of their efforts; if ``full``, fill ``H``, too."""
     servos, points, rows = body.servos, body.points, body.rows
     gradient, H, delta, tangent = equations.gradient, equations.H, equations.delta, equations.tangent
-    slope, curved = np.empty(3), np.empty(3)
+    slope, curved = equations.work.slope, equations.work.way
     if full:
         H[:] = 0.0
     _add_chambers(body.chambers, rows, x, effort, equations, full)
@@ -434,29 +437,33 @@ def add_constraints(body, x, effort, equations, full):
                     column[3 + k] -= weight * slope[j]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
 def _add_chambers(chambers, rows, x, effort, equations, full):
     """Do for chambers what `add_constraints` does for the others."""
     gradient, H, delta, tangent = equations.gradient, equations.H, equations.delta, equations.tangent
-    t, motion = np.empty(3), np.empty((3, 18))
+    t, motion = equations.work.way, equations.work.motion
     for c in range(chambers.number.shape[0]):
         delta[chambers.number[c]] = -chambers.rest[c]
     for q in range(chambers.chamber.shape[0]):
         c, area, frames, weights = chambers.chamber[q], chambers.area[q], chambers.frames[q], chambers.weights[q]
-        t[:] = 0.0
+        u, v, w = 0.0, 0.0, 0.0
         for a in range(3):
             for k in range(4):
-                for d in range(3):
-                    t[d] += weights[a, k] * x[frames[a] + k, d]
-        norm = np.sqrt(t[0] * t[0] + t[1] * t[1] + t[2] * t[2])
+                row, share = frames[a] + k, weights[a, k]
+                u += share * x[row, 0]
+                v += share * x[row, 1]
+                w += share * x[row, 2]
+        norm = np.sqrt(u * u + v * v + w * w)
         delta[c] += area * norm
-        for d in range(3):
-            t[d] /= norm
+        t[0], t[1], t[2] = u / norm, v / norm, w / norm
         pull = effort[c] * area
+        u, v, w = pull * t[0], pull * t[1], pull * t[2]
         for a in range(3):
             for k in range(4):
-                for d in range(3):
-                    gradient[frames[a] + k, d] -= pull * weights[a, k] * t[d]
+                row, share = frames[a] + k, weights[a, k]
+                gradient[row, 0] -= share * u
+                gradient[row, 1] -= share * v
+                gradient[row, 2] -= share * w
         if not full:
             continue
         # The motion of the tangent: frame a, or the one on which it is mounted, moves it by weights[a, 0] u + w x p.
@@ -498,7 +505,7 @@ def _add_chambers(chambers, rows, x, effort, equations, full):
                                 block[i, j] += value * motion[d, 6 * b + j]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def _hold(pattern, components, equations):
     """Replace the equations of components that are held by uncoupled ones."""
     tangent, H, free = equations.tangent, equations.H, components.free
@@ -521,15 +528,20 @@ def _hold(pattern, components, equations):
                     block[i, j] *= free[k, i] * free[other, j]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def assemble(body, x, effort, step, equations, full):
     """Fill the equations at rows ``x`` (n, 3) and efforts (size,); tangent and ``H`` only if ``full``."""
-    assemble_parts(body, x, effort, step, equations, full, full)
+    forget_near(equations.slides)
+    assemble_parts(body, x, effort, step, equations, full, full, full)
 
 
-@njit(cache=True, error_model="numpy")
-def assemble_parts(body, x, effort, step, equations, full, touching):
-    """Fill the equations as `assemble`, the stiffness of contact only if ``touching``."""
+@njit(cache=True, error_model="numpy", _nrt=False)
+def assemble_parts(body, x, effort, step, equations, full, touching, pressing):
+    """Fill the equations as `assemble`, the stiffness of contact only if ``touching``.
+
+    The forces of contact turn with the frames; the tangent has that only if ``pressing``, without which pressed bodies
+    may be unstable if they lack the stiffness of what presses on them.
+    """
     gradient = equations.gradient
     for row in range(x.shape[0]):
         for d in range(3):
@@ -540,7 +552,7 @@ def assemble_parts(body, x, effort, step, equations, full, touching):
     _add_drag(body.elements, x, step, equations, full)
     _add_inertia(body.masses, x, step, equations, full)
     add_constraints(body, x, effort, equations, full)
-    if full and not touching:  # pressed bodies may be unstable without the stiffness of what presses on them
+    if full and not pressing:
         add_curvature(body.frames, x, gradient, equations.tangent)
     add_contact(body.contact, equations.slides, x, step.anchors, equations, touching)
     reduce_forces(body.frames, x, gradient, equations.residual)
@@ -549,7 +561,7 @@ def assemble_parts(body, x, effort, step, equations, full, touching):
         for i in range(6):
             residual[k, i] *= free[k, i]
     if full:
-        if touching:
+        if pressing:
             add_curvature(body.frames, x, gradient, equations.tangent)
         _hold(body.pattern, body.components, equations)
         hold_slides(equations.slides, free)

@@ -27,7 +27,7 @@ def orthonormalise(frames, x):
                 x[row + 1 + k, d] = value
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
 def move(frames, x, motion, turned):
     """Move the frames in place by ``motion`` (b, 6): displacements of their origins [m], and spins [rad].
 
@@ -64,7 +64,7 @@ def move(frames, x, motion, turned):
             x[row, d] = value
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
 def motion_of(frames, free, x, velocity, h, out):
     """Fill ``out`` (b, 6) with ``h`` times the motion of the frames at ``x`` (n, 3) with velocities of the rows."""
     for f in range(frames.rows.shape[0]):
@@ -80,7 +80,7 @@ def motion_of(frames, free, x, velocity, h, out):
             out[block, i] *= free[block, i]
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
 def reduce_forces(frames, x, forces, out):
     """Fill ``out`` (b, 6) with the forces and moments of ``forces`` (n, 3) on the frames.
 
@@ -109,7 +109,7 @@ def reduce_forces(frames, x, forces, out):
         target[3], target[4], target[5] = a, b, c
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
 def add_curvature(frames, x, gradient, tangent):
     """Add the second derivative of rotations, ``(g d^T + d g^T) / 2 - (g . d) 1`` for each director.
 
@@ -138,7 +138,7 @@ def add_curvature(frames, x, gradient, tangent):
         block[5, 4] += 0.5 * r
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
 def rows_moved(frames, x, motion, out):
     """Fill ``out`` (n, 3) with the motion of all rows at ``x`` (n, 3) that ``motion`` (b, 6) of the frames causes."""
     out[:] = 0.0

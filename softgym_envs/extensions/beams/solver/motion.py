@@ -17,12 +17,12 @@ import numpy as np
 from numba import types
 from numba.extending import overload
 
-from softgym_envs.extensions.beams.solver.block_cholesky import SIZE
+from softgym_envs.extensions.beams.solver.block_cholesky import SIZE, copy_values
 from softgym_envs.extensions.beams.solver.body import beam_body, reason_for_general
 from softgym_envs.extensions.beams.solver.contact import (
-    ContactPoints,
     Slides,
     commit,
+    forget_near,
     free_part,
     has_failed,
     touching,
@@ -45,6 +45,7 @@ from softgym_envs.extensions.beams.solver.newton import (
     make_system,
     solve,
 )
+from softgym_envs.extensions.beams.solver.points import ContactPoints
 from softgym_envs.extensions.beams.solver.touching import solve_touching
 from softgym_envs.mechanics.compilation import njit
 from softgym_envs.mechanics.contact.obstacles import MeshObstacle
@@ -147,7 +148,7 @@ def restore_state(state, kept):
     state.totals[:] = kept.totals
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def _predict(contact, slides, body, factor, start, x):
     """Move rows ``x`` as far along the step of ``factor`` as no point enters an obstacle."""
     move(body.frames, x, factor.step, factor.turned)
@@ -160,7 +161,7 @@ def _predict(contact, slides, body, factor, start, x):
         for k in range(factor.step.shape[0]):
             for i in range(SIZE):
                 factor.step[k, i] *= part
-        x[:] = start
+        copy_values(start, x)
         move(body.frames, x, factor.step, factor.turned)
 
 
@@ -250,8 +251,8 @@ def _advance(system, strains, state, target, drive, stepping, h, fresh, easy, fi
         for d in range(3):
             kinetic += 0.5 * velocity[i, d] * momentum[i, d]
     totals[0] = kinetic
-    totals[1], drag = strain_work(body.elements, x, step)
-    totals[3] += drag + drag_work(body.elements, x, step) + 2.0 * alpha * h * kinetic
+    totals[1], drag = strain_work(body.elements, x, step, equations.work)
+    totals[3] += drag + drag_work(body.elements, x, step, equations.work) + 2.0 * alpha * h * kinetic
     commit(body.contact, equations.slides, x, state.anchors, totals)
     return True
 
@@ -267,6 +268,7 @@ def march_rows(system, strains, state, targets, drive, limit, stepping, finish, 
     kept, effort = copy_state(state), state.effort
     first, goal = np.empty(effort.shape[0]), np.empty(effort.shape[0])
     orthonormalise(system.body.frames, state.x)
+    forget_near(system.equations.slides)
     without = not stepping.h > 0.0  # no literal, for which everything would be compiled again
     add_constraints(system.body, state.x, effort, system.equations, without)
     state.delta[:] = system.equations.delta

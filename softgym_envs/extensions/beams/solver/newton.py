@@ -1,8 +1,7 @@
 """Newton's method for bodies of beams, compiled: equations are linearised, factorised and solved for one time step.
 
 `solve` takes whole steps and keeps its factor while it converges fast. `approach` shortens steps and divides the way to
-the target into increments, as `Statics` does. `solve_in_contact` takes steps as far as no point enters an obstacle;
-`beam_touching` goes on where it fails.
+the target into increments, as `Statics` does. `touching` solves for bodies that may touch something.
 """
 
 from __future__ import annotations
@@ -11,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from softgym_envs.extensions.beams.solver.block_cholesky import SIZE, factorise, solve_lower, solve_upper
+from softgym_envs.extensions.beams.solver.block_cholesky import SIZE, copy_values, factorise, solve_lower, solve_upper
 from softgym_envs.extensions.beams.solver.body import BeamBody
-from softgym_envs.extensions.beams.solver.contact import free_part, has_failed, slide
+from softgym_envs.extensions.beams.solver.contact import has_failed, slide
 from softgym_envs.extensions.beams.solver.equations import (
     Equations,
     assemble,
@@ -37,11 +36,6 @@ LONG, LONG_IN_TIME, TOO_LONG = 0.01, 0.002, 1.0
 REMAINING, SMALLEST = 0.01, 1e-13
 """A solution is found when the next step will be shorter than this part of the tolerance, or than this length [m],
 which is near rounding. Errors of a time step act on the next one through the velocities."""
-MAX_CONTACT, WHOLE, LONGEST = 30, 1, 0.3
-"""With contact: the largest number of Newton iterations; that of whole ones, before the forces along steps are looked
-at; the longest step, as the largest turn of a frame [rad]."""
-MAX_TRIALS, BALANCED = 12, 0.3
-"""The largest number of parts of a step that are tried, and the part of the forces along it that may be left."""
 
 
 class Factor(NamedTuple):
@@ -56,6 +50,7 @@ class Factor(NamedTuple):
         signs: of the pivots, shape (b, 6).
         step: of the equations, shape (b, 6).
         efforts: step of the efforts, shape (size,).
+        gap: of the driven rows, shape (size,).
         turned: work array of `move`, shape (3, 3).
     """
 
@@ -66,6 +61,7 @@ class Factor(NamedTuple):
     signs: np.ndarray
     step: np.ndarray
     efforts: np.ndarray
+    gap: np.ndarray
     turned: np.ndarray
 
 
@@ -103,12 +99,13 @@ def make_system(body: BeamBody, size: int) -> System:
         signs=np.ones((blocks, SIZE)),
         step=np.zeros((blocks, SIZE)),
         efforts=np.zeros(size),
+        gap=np.zeros(size),
         turned=np.zeros((3, 3)),
     )
     return System(body, make_equations(body, size), factor)
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
 def _dot(a, b, signs):
     """Return the sum of the products of two vectors with signs, all of shape (b, 6)."""
     first, second, sign = a.reshape(a.size), b.reshape(b.size), signs.reshape(signs.size)
@@ -118,7 +115,7 @@ def _dot(a, b, signs):
     return value
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def factorise_tangent(system, rows):
     """Factorise the tangent and fill ``half`` and ``W`` of constraint rows; the number of its negative eigenvalues.
 
@@ -130,7 +127,7 @@ def factorise_tangent(system, rows):
         return -1
     for i in range(rows.shape[0]):
         half = factor.half[rows[i]]
-        half[:] = equations.H[rows[i]]
+        copy_values(equations.H[rows[i]], half)
         solve_lower(equations.tangent, body.pattern.pointers, body.pattern.columns, half)
         for j in range(i + 1):
             value = _dot(half, factor.half[rows[j]], factor.signs)
@@ -140,7 +137,7 @@ def factorise_tangent(system, rows):
     return negative
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=True)
 def _factorise_slides(slides, pattern, tangent, factor, rows):
     """Let sliding points change what follows from a factor of the symmetric part of the tangent."""
     if slides is None:
@@ -176,35 +173,41 @@ def invert_driven(factor, driven):
     factor.driven[:count, :count] = np.linalg.inv(among)
 
 
-@njit(cache=True, error_model="numpy", fastmath=FAST)
+@njit(cache=True, error_model="numpy")
 def correct(system, effort, target, drive):
     """Solve the linearised equations for the steps of the motions and of the efforts, as `Statics` does.
 
     Returns the largest displacement of the step; NaN if no set of taut actuators is consistent.
     """
+    n = drive.driven.shape[0]
+    total, index, is_one_way = np.empty(n), np.empty(n, dtype=np.int64), drive.one_way.any()
+    return _correct(system, effort, target, drive, is_one_way, np.empty((n, n)), np.empty((n, n + 1)), total, index)
+
+
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
+def _correct(system, effort, target, drive, is_one_way, among, a, total, index):
+    """Do what `correct` says; the last four are work arrays, as in `solve_row`."""
     body, equations, factor = system
     driven, forced, one_way = drive
     step, change, W = factor.step, factor.efforts, factor.compliance
-    step[:] = equations.residual
+    copy_values(equations.residual, step)
     solve_lower(equations.tangent, body.pattern.pointers, body.pattern.columns, step)
     slide(equations.slides, step, factor.signs)
     for i in range(forced.shape[0]):
         change[forced[i]] = target[forced[i]] - effort[forced[i]]
     count = driven.shape[0]
-    gap = np.empty(count)
+    gap = factor.gap
     for i in range(count):
         row = driven[i]
         gap[i] = equations.delta[row] - target[row] - _dot(factor.half[row], step, factor.signs)
         for j in range(forced.shape[0]):
             gap[i] += W[row, forced[j]] * change[forced[j]]
-    if one_way.any():
-        among = np.empty((count, count))
+    if is_one_way:
         for i in range(count):
             for j in range(count):
                 among[i, j] = W[driven[i], driven[j]]
                 gap[i] -= among[i, j] * effort[driven[j]]
-        total = np.empty(count)
-        if not solve_row(among, gap, one_way, total, np.empty((count, count + 1)), np.empty(count, dtype=np.int64)):
+        if not solve_row(among, gap[:count], one_way, total, a, index):
             return np.nan
         for i in range(count):
             change[driven[i]] = total[i] - effort[driven[i]]
@@ -391,96 +394,3 @@ def approach(system, x, effort, target, drive, step, tolerance):
         done = level
         size *= 1.5
     return iterations
-
-
-@njit(cache=True, error_model="numpy")
-def take(system, kept, x, stride, part):
-    """Move rows ``x`` by a part of a step from those ``kept``."""
-    factor, x[:] = system.factor, kept
-    for k in range(stride.shape[0]):
-        for i in range(SIZE):
-            factor.step[k, i] = part * stride[k, i]
-    move(system.body.frames, x, factor.step, factor.turned)
-
-
-@njit(cache=True, error_model="numpy", inline="always")
-def _part_of_step(system, kept, x, stride, effort, step, most, start):
-    """Return the part of a step, up to ``most``, at which the forces along it vanish; rows ``x`` are moved by it.
-
-    ``start`` < 0 are the forces along the step at its start with the efforts (size,) at its end. Where a point passes
-    from sliding one way over sticking to sliding the other way, they change nearly at once, and whole steps would go
-    to and fro for ever.
-    """
-    body, equations, _ = system
-    ones = np.ones_like(stride)
-    low, high, part, below, above = 0.0, most, most, start, np.inf
-    for trial in range(MAX_TRIALS):
-        take(system, kept, x, stride, part)
-        assemble(body, x, effort, step, equations, not step.h > 0.0)
-        along = np.inf if has_failed(equations.slides) else _dot(equations.residual, stride, ones)
-        if abs(along) <= BALANCED * abs(start) or (trial == 0 and along < 0.0):
-            break
-        if along > 0.0:
-            high, above, below = part, along, (0.5 * below if above < np.inf else below)
-        else:
-            low, below, above = part, along, 0.5 * above
-        part = 0.5 * (low + high) if above == np.inf else (low * above - high * below) / (above - below)
-    return part
-
-
-@njit(cache=True, error_model="numpy")
-def solve_in_contact(system, x, effort, target, drive, step, tolerance, fresh):
-    """Solve the equations of a time step in place as `solve` does, where points may touch; the iterations, or -1.
-
-    Rows ``x`` must lie outside the obstacles. Steps end where points would enter an obstacle and, if they do not soon
-    converge, where the forces along them vanish.
-    """
-    body, equations, factor = system
-    rows = np.concatenate((drive.driven, drive.forced))
-    radian, ones = body.components.scale[:, 3:].max(), np.ones_like(factor.step)
-    before, taken = np.inf, 0
-    enough = min(tolerance, max(REMAINING * tolerance, SMALLEST))
-    stride, kept = factor.step.copy(), x.copy()
-    for iteration in range(1, MAX_CONTACT + 1):
-        if fresh:
-            if _linearise(system, x, effort, step, drive, rows, False) < 0:
-                return -1
-            taken = 0
-        else:
-            number = equations.slides.number[0]  # that of the factor, which stays as it is
-            assemble(body, x, effort, step, equations, not step.h > 0.0)
-            if has_failed(equations.slides):
-                return -1
-            equations.slides.number[0] = number
-        length = correct(system, effort, target, drive)
-        if not length < np.inf:  # also true for NaN
-            return -1
-        ratio = length / before if before < np.inf else 1.0
-        if not fresh and (ratio > SLOW if iteration > 1 else length > LONG_IN_TIME * radian):
-            fresh = True  # this step is not taken
-            continue
-        start = 0.0
-        if fresh and iteration > WHOLE and length > LONG_IN_TIME * radian:
-            start = _dot(equations.residual, factor.step, ones)
-            for c in range(effort.shape[0]):
-                start -= factor.efforts[c] * _dot(equations.H[c], factor.step, ones)
-        for c in range(effort.shape[0]):
-            effort[c] += factor.efforts[c]
-        stride[:] = factor.step
-        kept[:] = x
-        part, free = min(1.0, LONGEST * radian / length), 0.0
-        while free < 1.0:
-            take(system, kept, x, stride, part)
-            free = free_part(body.contact, equations.slides, kept, x)
-            part *= free  # the way bends, so it is tested again
-            if part < SHORTEST:
-                return -1
-        if start < 0.0:
-            part = _part_of_step(system, kept, x, stride, effort, step, part, start)
-        taken += 1
-        # After a step with a new factor the next one shrinks by the square of the ratio.
-        if part == 1.0 and (length <= enough or length * ratio * (1.0 if taken == 1 else 2.0) <= enough):
-            return iteration
-        fresh = part < 1.0 or length > LONG_IN_TIME * radian
-        before = length if part == 1.0 else np.inf
-    return -1
