@@ -1,4 +1,4 @@
-"""CPU time of a step: ``python peers.py softgym|softrobot|mujoco`` in an environment that has the package."""
+"""CPU time of a step: ``python peers.py softgym|softrobot|mujoco|evogym`` in an environment that has the package."""
 
 import sys
 import time
@@ -53,5 +53,15 @@ def mujoco():
     print(f"flex of {model.flex_elemnum[0]} tetrahedra, 50 ms: {25 * cpu(lambda: engine.mj_step(model, data), 100):.1f} ms")
 
 
+def evogym():
+    import evogym.envs
+    import gymnasium
+    import numpy
+
+    numpy.random.seed(0)
+    body, _ = evogym.sample_robot((5, 5))
+    print(f"Walker-v0: {step_time(gymnasium.make('Walker-v0', body=body), 200):.2f} ms")
+
+
 if __name__ == "__main__":
-    {"softgym": softgym, "softrobot": softrobot, "mujoco": mujoco}[sys.argv[1]]()
+    {"softgym": softgym, "softrobot": softrobot, "mujoco": mujoco, "evogym": evogym}[sys.argv[1]]()
