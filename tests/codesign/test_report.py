@@ -42,7 +42,7 @@ def write_trial(folder, number, score, place, controller="qp"):
         origin="baseline" if number == 0 else f"sampler {number}",
         process="",
         design={**folder.config.baseline, **design},
-        values={"mean_distance": score},
+        values={"mean_distance": score, "mean_effort": score},
         scores=[-score],
         controller=controller,
         evaluation=evaluation([score]),
@@ -50,7 +50,7 @@ def write_trial(folder, number, score, place, controller="qp"):
 
 
 def write_test(folder, number, agent, distances):
-    values = {"mean_distance": float(np.mean(distances))}
+    values = dict.fromkeys(("mean_distance", "mean_effort"), float(np.mean(distances)))
     test = FinalistTest(number, agent, "fem", "unseen", 0, evaluation(distances), values, list(distances))
     test.write(folder.path / "finalists" / f"trial{number:04d}-{agent}-fem-unseen.json")
 
@@ -59,8 +59,9 @@ def write_test(folder, number, agent, distances):
 def tested(study):
     """Function ``tested(policy, qp, place) -> snapshot``: baseline and winner on six goals, distances in metres."""
 
-    def make(policy, qp, place=(0.5, 0.5)):
-        folder = study(finalists={"count": 1}, goals={"count": 3, "unseen_count": 6, "training_count": 1})
+    def make(policy, qp, place=(0.5, 0.5), **changes):
+        goals = {"count": 3, "unseen_count": 6, "training_count": 1}
+        folder = study(finalists={"count": 1}, goals=goals, **changes)
         (folder.path / "trials").mkdir(exist_ok=True)
         write_trial(folder, 0, 5e-3, (0.0, 0.3), controller="a policy")
         write_trial(folder, 1, 1e-3, place, controller="a policy")
@@ -286,6 +287,13 @@ def test_surrogate_and_fem_that_disagree_are_named(tested):
 def test_a_baseline_that_the_inverse_qp_prefers_is_named(tested, qp, named):
     found = titles(tested(NEAR, np.full(6, qp)))
     assert ("With the inverse QP, the baseline is the better body" in found) == named
+
+
+@pytest.mark.parametrize("objective", ["mean_distance", "mean_effort"])
+def test_bodies_are_compared_by_distance_only_where_the_study_does(tested, objective):
+    found = titles(tested(np.full(6, 4.3e-3), np.full(6, 9e-3), objective=objective))
+    named = {"With the inverse QP, the baseline is the better body", "Other bodies do as well"}.intersection(found)
+    assert len(named) == (2 if objective == "mean_distance" else 0)
 
 
 def test_the_policy_limits_only_where_the_qp_closes_a_substantial_part(tested):

@@ -139,9 +139,16 @@ def _physics(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:
     return None
 
 
+def _is_about_distance(snapshot: StudySnapshot) -> bool:
+    """Return whether the better of two bodies is the one that ends nearer to its goals."""
+    return snapshot.config.objective in ("mean_distance", "success_rate")
+
+
 def _ranking(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:
-    """Return whether the inverse QP on FEM, which needs no training, prefers the baseline."""
-    if results.winner is None or results.winner.role == "baseline":
+    """Return whether the inverse QP on FEM, which needs no training, prefers the baseline that the policies left."""
+    if results.winner is None or results.winner.role == "baseline" or not _is_about_distance(snapshot):
+        return None
+    if results.winner.agents[0] == "qp":  # no policy that could be easier to train
         return None
     row = next((row for row in results.comparison if (row.backend, row.agent) == ("fem", "qp")), None)
     if row is None or not row.distance_change > NEGLIGIBLE * results.success_distance:
@@ -276,6 +283,8 @@ def _bounds(results: StudyResults) -> Finding | None:
 def _alternatives(snapshot: StudySnapshot, results: StudyResults) -> Finding | None:
     """Return the finalists whose mean distance on FEM is about that of the winner, and how their bodies differ."""
     assert results.winner is not None
+    if not _is_about_distance(snapshot):
+        return None
     agent = results.winner.agents[0]
     tests = {group.key: group.mean.mean_distance for group in snapshot.unseen_tests}
     own = tests.get((results.winner.trial, agent, "fem"))
