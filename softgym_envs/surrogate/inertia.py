@@ -1,11 +1,11 @@
 """Learned inertia: how slowly a body moves in the coordinates of its condensed model.
 
-Static reduction of a body gives the mass ``M`` about an equilibrium in its constraint values and its inner modes.
-The mass follows from the compliance ``W`` of a learned model and from the matrix of squared
-periods, ``P = K^-1/2 M K^-1/2`` with ``K = diag(W^-1, 1)`` and the roots of `half_stiffness`: its eigenvalues are
-``1 / omega^2`` of the free body [s2]. They change far less from body to body than masses do, and they are all that is
-learned here: the logarithm of the diagonal of the Cholesky factor of ``P`` and its other entries, relative to that
-diagonal, are polynomials of the design and of the reached displacements, so ``P`` is positive definite everywhere.
+Static reduction of a body gives the mass ``M`` about an equilibrium in its constraint values and its inner modes. The
+mass follows from the compliance ``W`` of a learned model and from the matrix of squared periods, ``P = K^-1/2 M
+K^-1/2`` with ``K = diag(W^-1, 1)`` and the roots of `half_stiffness`: its eigenvalues are ``1 / omega^2`` of the free
+body [s2]. They change far less from body to body than masses do, and they are all that is learned here: the logarithm
+of the diagonal of the Cholesky factor of ``P`` and its other entries, relative to that diagonal, are polynomials of the
+design and of the reached displacements, so ``P`` is positive definite everywhere.
 """
 
 from __future__ import annotations

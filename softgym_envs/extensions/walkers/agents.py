@@ -22,14 +22,14 @@ class GaitAgent:
             default the reference gait of the robot, which is the same for all bodies.
 
     Raises:
-        WeightsError: for a policy without a gait.
+        WeightsError: for a policy without a gait, or whose gait drives another number of actuators.
     """
 
     title = "common gait"
     takes_policy = True
 
     def __init__(self, seed: int = 0, policy: str | None = None) -> None:
-        self._clock = None if policy is None else Policy(policy).clock
+        self._policy, self._clock = policy, None if policy is None else Policy(policy).clock
         if policy is not None and self._clock is None:
             raise WeightsError(f"policy '{policy}' has no gait; allowed: those of the learners gait and horizon")
 
@@ -40,6 +40,11 @@ class GaitAgent:
             gait = self.led(robot.reference_gait(), env)
             action: np.ndarray = spaces.action(gait[(env.steps + 1) % len(gait)], env.command)
             return action
+        if self._clock.shape[1] != len(robot.actuators):
+            raise WeightsError(
+                f"the gait of policy '{self._policy}' drives {self._clock.shape[1]} actuators; "
+                f"'{robot.name}' has {len(robot.actuators)}"
+            )
         # Where the policy would be after each step, and how it goes there.
         gait = self.led(spaces.middle + robot.rates * self._clock, env)
         return np.tanh((gait[env.steps % len(gait)] - env.command) / robot.rates)

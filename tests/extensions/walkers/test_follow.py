@@ -96,6 +96,9 @@ def test_agents_with_the_gait_of_a_policy_need_one():
         make_baseline("qp@x")
     with pytest.raises(WeightsError, match="policy 'tetrapod_carry' has no gait"):
         make_baseline("steer@tetrapod_carry")
+    env = gymnasium.make("SoftGym/FingerReach-v0").unwrapped
+    with pytest.raises(WeightsError, match="'quadruped_walk_gait' drives 8 actuators; 'finger' has 2"):
+        make_baseline("gait@quadruped_walk_gait")(env.reset(seed=0)[0], env)
     with pytest.raises(WeightsError, match="unknown policy 'nothing'"):
         make_baseline("steer@nothing")
 
