@@ -53,27 +53,28 @@ def mean_effort(outcome: Outcome) -> np.ndarray:
     return outcome.evaluation.efforts
 
 
-@metric("effort", label="Largest actuator effort", over_path=True)
+@metric("effort", label="Largest actuator effort", worst=True)
 def largest_effort(outcome: Outcome) -> np.ndarray | None:
-    """Return the largest effort of any actuator in any step of each episode."""
+    """Return the largest effort of any actuator in any step of any episode."""
     return outcome.evaluation.largest_efforts
 
 
-@metric(shown=PERCENT, label="Largest strain of a drive", over_path=True)
+@metric(shown=PERCENT, label="Largest strain of a drive", worst=True)
 def largest_strain(outcome: Outcome) -> np.ndarray | None:
-    """Return the largest displacement of a drive in each episode over its length or volume at rest."""
-    return _known(outcome.evaluation.largest_strains, "largest_strain", "cables and chambers")
+    """Return the largest displacement of a drive in any episode over its length or volume at rest."""
+    where = "on finite elements, or for bodies made of beams, and not for servos"
+    return _known(outcome.evaluation.largest_strains, "largest_strain", where)
 
 
-@metric("N", label="Self-contact", over_path=True)
+@metric("N", label="Self-contact", worst=True)
 def self_force(outcome: Outcome) -> np.ndarray | None:
-    """Return the largest force in each episode with which surfaces of the body press on each other."""
-    return _known(outcome.evaluation.self_forces, "self_force", "bodies with self-contact")
+    """Return the largest force in any episode with which surfaces of the body press on each other."""
+    return _known(outcome.evaluation.self_forces, "self_force", "on finite elements, for bodies with self-contact")
 
 
 def _known(values: np.ndarray | None, name: str, where: str) -> np.ndarray:
     if values is None or np.isnan(values).any():
-        raise ValueError(f"metric '{name}' is computed on finite elements only, for {where}")
+        raise ValueError(f"metric '{name}' is known {where}; leave it out here")
     return values
 
 

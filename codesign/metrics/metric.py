@@ -32,7 +32,7 @@ Direction = Literal["maximize", "minimize"]
 class Measurement:
     """Value of a metric of episodes [SI]."""
 
-    value: float  # mean over the goals
+    value: float  # mean over the goals, or that of the worst one (`Metric.worst`)
     per_goal: list[float] | None = None  # for each goal, if the metric has such values
 
 
@@ -43,7 +43,7 @@ class Metric:
     Args:
         name: identifier, as in configurations and tables.
         function: takes what its source provides, see `softgym_envs.codesign.metrics.sources`, and returns a number
-            [SI]; of episodes also one number per goal, whose mean is then the metric; of states one per body.
+            [SI]; of episodes also one number per goal, whose mean (or worst) is the metric; of states one per body.
         unit: SI unit, ``"1"`` for a plain number. ``"effort"`` and ``"distance"`` stand for the unit of the efforts of
             the robot and of the distances of the task.
         direction: what a designer usually wants: ``"maximize"`` or ``"minimize"``.
@@ -51,6 +51,8 @@ class Metric:
         label: name in tables and figures; default the name in words.
         shown: how people read it; default by the unit.
         over_path: whether it is a mean or sum over the steps of an episode, and so not known from where episodes end.
+        worst: whether the worst goal counts, as for limits of a drive, and not the mean over the goals. Tests of ends
+            know the worst of the ends.
         description: one line for tables; default the first line of the function's documentation.
 
     Raises:
@@ -65,6 +67,7 @@ class Metric:
     label: str = ""
     shown: Display | None = None
     over_path: bool = False
+    worst: bool = False
     description: str = ""
 
     def __post_init__(self) -> None:
@@ -102,7 +105,8 @@ class Metric:
                 f"metric '{self.name}' is not finite for design {dict(outcome.design)}; raise InfeasibleDesign if the "
                 "body cannot exist"
             )
-        return Measurement(float(found.mean()), found.astype(float).tolist() if found.ndim else None)
+        value = (found.min() if self.maximize else found.max()) if self.worst else found.mean()
+        return Measurement(float(value), found.astype(float).tolist() if found.ndim else None)
 
     # -- comparison -------------------------------------------------------------------------------------------------
 

@@ -17,6 +17,7 @@ import numpy as np
 from softgym_envs.agents.config import EnvironmentConfig
 from softgym_envs.agents.evaluation import Evaluation, drive_strains, make_agent, self_force
 from softgym_envs.agents.policy import Policy
+from softgym_envs.backends.backend import drive_sizes
 from softgym_envs.control.settling import nearest_next, settle
 from softgym_envs.errors import ConfigError, ConvergenceError
 from softgym_envs.mechanics.solvers.statics import Statics
@@ -178,7 +179,7 @@ def _settle(asked: _PendingGoals) -> tuple[dict[int, _End], int]:
     robot = asked.environment.make_robot()
     success = asked.environment.make_task(robot).success_distance
     statics, ends = Statics(robot.build(asked.design)), {}
-    rest = np.array([drive.rest_size() for drive in statics.model.constraints["a"]])
+    rest = drive_sizes(statics.model)
     for k in asked.order:
         point, command = asked.points[k], asked.commands[k]
         try:

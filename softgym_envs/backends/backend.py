@@ -19,6 +19,7 @@ from softgym_envs.wording import brief
 
 if TYPE_CHECKING:
     from softgym_envs.mechanics.contact.contact import Contacts
+    from softgym_envs.mechanics.model import MechanicalModel
     from softgym_envs.mechanics.solvers.dynamics import Motion
 
 #: A displacement this many times as large as the bounds of its actuator is taken for a mistake in its unit.
@@ -257,6 +258,11 @@ def check_touch(robot: Robot, rest: State, load: object) -> PointForce | None:
         raise ValueError(f"touch = {brief(load)} must be a PointForce(point=..., force=...) or None")
     check_force(robot, rest, load.force, "force of a touch")
     return load
+
+
+def drive_sizes(model: MechanicalModel) -> np.ndarray:
+    """Return `Constraint.rest_size` of each actuator of a model, shape (n_a,): NaN for servos."""
+    return np.array([drive.rest_size() for drive in model.constraints["a"] for _ in range(drive.size)])
 
 
 def refuse_force(force: np.ndarray | None) -> None:

@@ -17,6 +17,7 @@ from softgym_envs.backends.backend import (
     check_command,
     check_force,
     check_touch,
+    drive_sizes,
 )
 from softgym_envs.backends.time_steps import TimeSteps, check_still
 from softgym_envs.designs import Design
@@ -256,7 +257,7 @@ class FEMBackend(Backend):
 
     @property
     def rest_sizes(self) -> np.ndarray:
-        return np.array([drive.rest_size() for drive in self.model.constraints["a"] for _ in range(drive.size)])
+        return drive_sizes(self.model)
 
     @property
     def cable_compliance(self) -> np.ndarray:

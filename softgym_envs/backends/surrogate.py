@@ -16,6 +16,7 @@ from softgym_envs.backends.backend import (
     State,
     check_command,
     check_touch,
+    drive_sizes,
     refuse_force,
 )
 from softgym_envs.backends.batch import BatchBackend, BatchState
@@ -239,6 +240,18 @@ class SurrogateBatch(BatchBackend):
         if len(other):
             self.begin(other, designs[other])
 
+    @property
+    def rest_sizes(self) -> np.ndarray | None:
+        """Those of bodies of beams, which are built in milliseconds; None for others, whose meshes take seconds."""
+        if not self.robot.made_of_beams:
+            return None
+        different, where = np.unique(self._designs, axis=0, return_inverse=True)
+        sizes = []
+        for values in different:
+            design = dict(zip(self.robot.design_space.names, values.tolist(), strict=True))
+            sizes.append(drive_sizes(self.robot.build(design)))
+        return np.array(sizes)[where.ravel()]
+
     def _values(self, designs: np.ndarray, touch: Mapping[str, float] | None = None) -> np.ndarray:
         """Return designs of the model, whose variables also say what touches a body; by default nothing does."""
         if self._touch is None:
@@ -461,6 +474,11 @@ class SurrogateBackend(Backend):
     @classmethod
     def batch_class(cls, robot: Robot, options: Mapping[str, object]) -> type[BatchBackend]:
         return SurrogateBatch
+
+    @property
+    def rest_sizes(self) -> np.ndarray | None:
+        sizes = self._batch.rest_sizes
+        return None if sizes is None else sizes[0]
 
     def reset(self, design: Mapping[str, float] | None = None) -> State:
         complete = self.design if design is None else self.robot.design_space.complete(design)

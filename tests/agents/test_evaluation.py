@@ -84,6 +84,16 @@ def test_largest_efforts_are_those_of_any_actuator_in_any_step(backend):
     assert np.isnan(found.self_forces).all()  # no surface touches another one
 
 
+def test_strains_of_chambers_of_beams_are_known_on_the_surrogate():
+    environment = EnvironmentConfig(id="SoftGym/TrunkReach-v0", max_episode_steps=6)
+    goals = sample_goals(environment, 3, seed=0)
+    for design in ({}, {"chamber_radius": 0.0006}):
+        found = [evaluate("qp", environment.on(backend), goals, design=design) for backend in ("surrogate", "fem")]
+        np.testing.assert_allclose(found[0].largest_strains, found[1].largest_strains, rtol=2e-2)
+    # The chambers are smaller by 0.6^2 / 0.719^2, and stretch more.
+    assert found[0].largest_strains.min() > 0.02
+
+
 @pytest.mark.parametrize("backend", ["surrogate", "fem"])  # together and one by one
 def test_settled_distances_are_means_over_the_last_steps(backend):
     steps = SETTLED + 3

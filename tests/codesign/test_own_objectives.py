@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -157,3 +159,19 @@ def test_robot_of_ones_own(tmp_path, tiny):
     results = run_study(config, tmp_path / "study", progress=False)
     assert results.trials["complete"] == 2
     assert {row.backend for row in results.comparison} == {"fem"}
+
+
+def test_limits_of_drives_hold_at_the_worst_goal_not_in_the_mean():
+    distances = np.array([1e-3, 3e-3])
+    evaluation = Evaluation(
+        distances, distances, distances, distances < 2e-3, distances, np.zeros((2, 3)), steps=2,
+        largest_efforts=np.array([1.0, 9.0]), largest_strains=np.array([0.1, 0.3]), self_forces=np.array([0.0, 32.0]),
+    )  # fmt: skip
+    outcome = Outcome(evaluation, {}, make_robot("finger"))
+    found = {name: METRICS[name].measure(outcome) for name in ("largest_effort", "largest_strain", "self_force")}
+    assert [each.value for each in found.values()] == [9.0, 0.3, 32.0]
+    assert found["largest_effort"].per_goal == [1.0, 9.0]
+    assert METRICS["mean_distance"].measure(outcome).value == pytest.approx(2e-3)
+    unknown = Outcome(replace(evaluation, self_forces=None), {}, outcome.robot)
+    with pytest.raises(ValueError, match="'self_force' is known on finite elements, for bodies with self-contact"):
+        METRICS["self_force"].measure(unknown)
