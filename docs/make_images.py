@@ -33,7 +33,7 @@ from softgym_envs.extensions.modules import MODULES
 from softgym_envs.mechanics import Statics
 from softgym_envs.robots import ROBOTS
 from softgym_envs.viewer.image import ImageRenderer
-from softgym_envs.viewer.video import write_video
+from softgym_envs.extensions.recordings.films import write_video
 
 # Share of the range of each actuator, for the actuated half of a robot's picture.
 COMMANDS: dict[str, tuple[float, ...]] = {

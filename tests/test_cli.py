@@ -14,7 +14,7 @@ from PIL import Image
 
 from softgym_envs.cli import app
 from softgym_envs.codesign.scheduling import worker
-from softgym_envs.viewer.video import write_video
+from softgym_envs.extensions.recordings.films import write_video
 
 ROOT = Path(__file__).resolve().parent.parent
 

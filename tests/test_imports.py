@@ -36,9 +36,9 @@ LAYERS = [
     {"softgym_envs.cli"},
     # Extensions: no core package imports one. Those of one layer do not know each other.
     {"softgym_envs.extensions", "softgym_envs.extensions.beams", "softgym_envs.extensions.checks"}
-    | {"softgym_envs.extensions.postgres", "softgym_envs.extensions.recordings"}
-    | {"softgym_envs.extensions.design", "softgym_envs.extensions.report", "softgym_envs.extensions.sweeps"},
-    {"softgym_envs.extensions.fitting"},
+    | {"softgym_envs.extensions.postgres", "softgym_envs.extensions.recordings", "softgym_envs.extensions.sweeps"},
+    {"softgym_envs.extensions.fitting", "softgym_envs.extensions.report"},
+    {"softgym_envs.extensions.design"},
     {
         "softgym_envs.extensions.gpu",
         "softgym_envs.extensions.grasping",

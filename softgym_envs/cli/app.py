@@ -29,7 +29,6 @@ SECTIONS = {
     "Environments": {
         "list": "environments:list_",
         "rollout": "environments:rollout",
-        "view": "environments:view",
     },
     "Robots": {
         "show": "robots:show",

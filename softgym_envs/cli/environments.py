@@ -1,4 +1,4 @@
-"""Verbs for environments: list, rollout, view."""
+"""Verbs for environments: list, rollout."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ import click
 
 from softgym_envs.cli import options
 from softgym_envs.errors import ConfigError
-from softgym_envs.extras import require
 from softgym_envs.registry import import_object
 from softgym_envs.wording import counted
 
@@ -145,8 +144,6 @@ def list_(as_json: bool) -> None:
 @click.option("--backend", help="surrogate, hybrid or fem (default: the environment's).")
 @options.design
 @click.option("--seed", default=0, show_default=True, help="Seed of the episode.")
-@click.option("--record", type=options.PATH, help="Write a rerun recording (.rrd) to this file.")
-@click.option("--video", type=options.PATH, help="Write a film (.mp4, .gif or .webp) to this file.")
 @options.writers
 def rollout(
     environment: str | None,
@@ -154,8 +151,6 @@ def rollout(
     backend: str | None,
     design: tuple[str, ...],
     seed: int,
-    record: Path | None,
-    video: Path | None,
     **chosen: Any,
 ) -> dict[str, Any]:
     """Run one episode and print its result.
@@ -166,35 +161,21 @@ def rollout(
     import softgym_envs  # noqa: F401 - registers the IDs
     from softgym_envs.agents.evaluation import make_agent
     from softgym_envs.surrogate.domain import distrust_text
-    from softgym_envs.viewer.moment import WRITERS, Watcher
-    from softgym_envs.viewer.recording import Filmed, recorder_of, watch_rollout
+    from softgym_envs.viewer.moment import WRITERS, watch_rollout
 
-    if record is not None and record.suffix != ".rrd":
-        raise ConfigError(f"recording '{record}' must end with .rrd; --video writes films")
     written: dict[str, Path] = {name: path for name in WRITERS if (path := chosen.pop(name)) is not None}
     for name, path in written.items():
-        if (suffix := WRITERS[name].suffix) and path.suffix != suffix:
-            raise ConfigError(f"file '{path}' of --{name} must end with {suffix}")
-    if video is not None:
-        from softgym_envs.viewer.video import check_video, write_video
-
-        check_video(video)  # before the work begins
+        if (suffixes := WRITERS[name].suffixes) and path.suffix not in suffixes:
+            allowed = " or ".join(", ".join(suffixes).rsplit(", ", 1))
+            raise ConfigError(f"file of --{name} '{path}' must end with {allowed}")
     body = options.design_of(design)
     config = environment_of_agents("rollout", (agent,), backend, id=environment, **chosen)
     act = make_agent(agent, seed)
-    drawn = {"render_mode": "rgb_array"} if video is not None else {}
+    drawn = {"render_mode": "rgb_array"} if any(WRITERS[name].draws for name in written) else {}
     env = config.make(**({"design": body} if body else {}), **drawn)
-    frames: list[Any] = []
     with contextlib.ExitStack() as open_files:
-        watchers: list[Watcher] = []
-        if record is not None:
-            watchers.append(open_files.enter_context(recorder_of(env, record)))
-        robot = env.unwrapped.robot  # type: ignore[attr-defined]
-        for name, path in written.items():
-            writer = import_object("writer of episodes", WRITERS[name].place)
-            watchers.append(open_files.enter_context(writer(robot, path)))
-        if video is not None:
-            watchers.append(Filmed(env, frames))
+        makers = {name: import_object("writer of episodes", WRITERS[name].place) for name in written}
+        watchers = [open_files.enter_context(makers[name](env.unwrapped, path)) for name, path in written.items()]
         summary = watch_rollout(env, act, watchers, seed=seed)
     total, step, distrust_codes = summary["return"], summary["steps"], summary["distrust_codes"]
     info = {"distance": summary["final_distance"], "is_success": summary["success"]}
@@ -206,30 +187,8 @@ def rollout(
         verb = "is" if len(distrusted) == 1 else "are"
         count = f"{len(distrusted)} of {len(distrust_codes)} states"
         click.echo(f"{count} {verb} not trusted: {reasons}; compare with --backend fem")
-    if video is not None:
-        write_video(video, frames, fps=env.metadata["render_fps"])
-        click.echo(f"wrote {video}")
-    if record is not None:
-        click.echo(f"wrote {record}; open it with 'softgym view {record}'")
     for name, path in written.items():
-        hint = WRITERS[name].hint
+        hint = WRITERS[name].hint.format(path=path)
         click.echo(f"wrote {path}{hint and '; '}{hint}")
     env.close()
     return {**summary, "backend": config.backend, "seed": seed}
-
-
-@click.command()
-@click.argument("recording", type=options.PATH)
-def view(recording: Path) -> None:
-    """Open a recording in the rerun viewer.
-
-    'softgym rollout ENVIRONMENT --record FILE' makes a recording.
-    """
-    import subprocess
-
-    if not recording.is_file():
-        raise ConfigError(f"recording '{recording}' does not exist; make one with 'softgym rollout ... --record'")
-    require("viewer")
-    if not any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")):
-        raise ConfigError(f"there is no display to open '{recording}' on; copy the file to a machine that has one")
-    sys.exit(subprocess.call([sys.executable, "-m", "rerun", "--bind", "127.0.0.1", str(recording)]))

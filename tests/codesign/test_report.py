@@ -7,7 +7,6 @@ from dataclasses import replace
 import gymnasium
 import numpy as np
 import pytest
-from PIL import Image, ImageSequence
 
 from softgym_envs.agents.evaluation import Evaluation
 from softgym_envs.codesign.collect import collect
@@ -20,7 +19,6 @@ from softgym_envs.extensions.report.motion import goal_outcomes, goal_views, mot
 from softgym_envs.extensions.report.sentences import headline
 from softgym_envs.extensions.report.tables import effort_rows
 from softgym_envs.mechanics import Plane
-from softgym_envs.viewer.video import write_video
 from softgym_envs.wording import time_text
 
 BOX = {"height": (0.020, 0.022), "joint_height": (0.005, 0.008)}
@@ -221,32 +219,6 @@ def test_finalists_differ(study):
     for number, place in enumerate(places, start=1):
         write_trial(folder, number, 1e-3 * number, place)
     assert [body.trial for body in load_study(folder).finalists] == [0, 1, 5]
-
-
-@pytest.mark.parametrize("ending", ["gif", "webp"])
-def test_animations(tmp_path, ending):
-    frames = [np.full((33, 48, 3), 40 * k, dtype=np.uint8) for k in range(5)]
-    path = write_video(tmp_path / f"film.{ending}", frames, fps=10.0)
-    with Image.open(path) as film:
-        seen = np.stack([np.asarray(image.convert("RGB")) for image in ImageSequence.Iterator(film)])
-        assert film.info["loop"] == 0
-    assert seen.shape == (5, 33, 48, 3)
-    np.testing.assert_allclose(seen.mean(axis=(1, 2, 3)), 40 * np.arange(5), atol=8)
-
-
-def test_a_film_of_odd_size_as_mp4(tmp_path):
-    from imageio_ffmpeg import count_frames_and_secs
-
-    frames = [np.full((33, 47, 3), 40 * k, dtype=np.uint8) for k in range(5)]
-    path = write_video(tmp_path / "film.mp4", frames, fps=10.0)
-    assert count_frames_and_secs(str(path)) == (5, 0.5)
-
-
-def test_wrong_films(tmp_path):
-    with pytest.raises(ValueError, match=r"must end with \.gif, \.webp or \.mp4"):
-        write_video(tmp_path / "film.avi", [np.zeros((4, 4, 3), np.uint8)])
-    with pytest.raises(ValueError, match="has no frames"):
-        write_video(tmp_path / "film.gif", [])
 
 
 @pytest.mark.parametrize(("seconds", "text"), [(2.41, "2.4 s"), (59.0, "59.0 s"), (606.0, "10.1 min")])

@@ -1,7 +1,10 @@
-"""Verb: record."""
+"""Verbs: record, view."""
 
 from __future__ import annotations
 
+import os
+import sys
+from pathlib import Path
 from typing import Any
 
 import click
@@ -9,6 +12,7 @@ import click
 from softgym_envs.cli import options
 from softgym_envs.cli.environments import AGENT_HELP, environment_of_agents
 from softgym_envs.errors import ConfigError
+from softgym_envs.extras import require
 from softgym_envs.wording import counted
 
 
@@ -46,3 +50,20 @@ def record(
     dataset = record_episodes(name, agent, config, episodes=episodes, design=body, seed=seed)
     episodes_text, steps_text = counted(dataset.total_episodes, "episode"), counted(dataset.total_steps, "step")
     click.echo(f"wrote {episodes_text}, {steps_text}: minari.load_dataset('{name}')")
+
+
+@click.command()
+@click.argument("recording", type=options.PATH)
+def view(recording: Path) -> None:
+    """Open a recording in the rerun viewer.
+
+    'softgym rollout ENVIRONMENT --record FILE' makes a recording.
+    """
+    import subprocess
+
+    if not recording.is_file():
+        raise ConfigError(f"recording '{recording}' does not exist; make one with 'softgym rollout ... --record'")
+    require("viewer")
+    if not any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY")):
+        raise ConfigError(f"there is no display to open '{recording}' on; copy the file to a machine that has one")
+    sys.exit(subprocess.call([sys.executable, "-m", "rerun", "--bind", "127.0.0.1", str(recording)]))

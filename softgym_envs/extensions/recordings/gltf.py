@@ -9,7 +9,7 @@ import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,6 +21,9 @@ from softgym_envs.storage import atomic_write
 from softgym_envs.viewer.moment import Moment
 from softgym_envs.viewer.scene import COLORS, STUB, Color
 from softgym_envs.viewer.surface import BodySurface, ShapeFinder, cable_lines, surface_kinds
+
+if TYPE_CHECKING:
+    from softgym_envs.envs.env import SoftRobotEnv
 
 FRAMES_PER_SECOND = 20.0
 CABLE_POINTS, CABLE_SIDES = 48, 6
@@ -106,6 +109,11 @@ class GlbWriter:
         if self._goals:
             file.add_ball("goal", self._goals, 0.034 * size, COLORS["goal"])
         return file.content()
+
+
+def writer_of(env: SoftRobotEnv, path: str | Path) -> GlbWriter:
+    """Return a writer of an environment's rollouts."""
+    return GlbWriter(env.robot, path)
 
 
 def write_glb(robot: Robot, path: str | Path, design: Mapping[str, float] | None = None) -> Path:

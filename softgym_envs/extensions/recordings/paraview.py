@@ -13,13 +13,14 @@ from softgym_envs.backends.backend import State
 from softgym_envs.errors import ConfigError
 from softgym_envs.extras import require
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.robots.base import Robot
 from softgym_envs.storage import atomic_write
 from softgym_envs.viewer.moment import Moment
 from softgym_envs.viewer.surface import BodySurface, ShapeFinder, cable_lines, chamber_skins, surface_kinds
 
 if TYPE_CHECKING:
     import pyvista
+
+    from softgym_envs.envs.env import SoftRobotEnv
 
 PARTS = {"volume": "vtu", "skin": "vtp", "cables": "vtp", "chambers": "vtp", "points": "vtp", "contacts": "vtp"}
 """Series of a folder, with the kind of their files; a part that a robot does not have is left out."""
@@ -40,20 +41,20 @@ class ParaviewWriter:
     Use it as a context manager: the ``.pvd`` files are written at the end of the block.
 
     Args:
-        robot: the family of bodies.
+        env: the environment.
         folder: new or empty folder.
 
     Raises:
         ConfigError: if the folder holds files.
     """
 
-    def __init__(self, robot: Robot, folder: str | Path) -> None:
+    def __init__(self, env: SoftRobotEnv, folder: str | Path) -> None:
         require("viewer")
-        self.robot = robot
+        self.robot = env.robot
         self.folder = Path(folder)
         if self.folder.exists() and any(self.folder.iterdir()):
             raise ConfigError(f"folder '{self.folder}' of the series is not empty; name a new one")
-        self._shapes = ShapeFinder(robot)
+        self._shapes = ShapeFinder(env.robot)
         self._model: MechanicalModel | None = None
         self._steps: dict[str, list[tuple[int, str]]] = {}
 

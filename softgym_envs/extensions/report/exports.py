@@ -117,8 +117,8 @@ def _download(folder: Path, name: str, text: str) -> Download:
 
 def write_film(path: Path, episodes: Sequence[Episode]) -> None:
     """Write a film of episodes side by side; each holds its last image until the longest one ends."""
+    from softgym_envs.extensions.recordings.films import write_video
     from softgym_envs.viewer.image import ImageRenderer
-    from softgym_envs.viewer.video import write_video
 
     films = []
     for episode in episodes:
@@ -143,8 +143,8 @@ def write_film(path: Path, episodes: Sequence[Episode]) -> None:
 
 
 def _record(path: Path, episodes: Sequence[Episode]) -> None:
+    from softgym_envs.extensions.recordings.rerun_file import RolloutRecorder
     from softgym_envs.viewer.moment import Moment
-    from softgym_envs.viewer.recording import RolloutRecorder
 
     roles, scale = [episode.role for episode in episodes], episodes[0].task.distance_scale
     with RolloutRecorder(episodes[0].robot, path, roles=roles, distance_scale=scale) as recorder:

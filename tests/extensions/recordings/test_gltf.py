@@ -11,7 +11,7 @@ import pytest
 from softgym_envs.errors import ConfigError
 from softgym_envs.extensions.recordings.gltf import FRAMES_PER_SECOND, GlbWriter, write_glb
 from softgym_envs.robots.registry import make_robot
-from softgym_envs.viewer.recording import watch_rollout
+from softgym_envs.viewer.moment import watch_rollout
 from softgym_envs.viewer.surface import BodySurface
 
 pytest.importorskip("pyvista")

@@ -12,7 +12,7 @@ from softgym_envs.extensions.recordings.paraview import ParaviewWriter, _volume
 from softgym_envs.mechanics import MechanicalModel
 from softgym_envs.robots import Actuator, Robot
 from softgym_envs.viewer import scene
-from softgym_envs.viewer.recording import watch_rollout
+from softgym_envs.viewer.moment import watch_rollout
 from tests.helpers import box_mesh
 
 pyvista = pytest.importorskip("pyvista")
@@ -28,7 +28,7 @@ def series(tmp_path_factory):
         states.append(body.state)
         return np.array([1.0, -0.2])
 
-    with ParaviewWriter(env.unwrapped.robot, folder) as writer:
+    with ParaviewWriter(env.unwrapped, folder) as writer:
         watch_rollout(env, agent, [writer], seed=0, steps=2)
     states.append(env.unwrapped.state)
     env.close()
@@ -65,7 +65,7 @@ def test_cells_have_the_volume_of_the_body(element):
 def test_a_folder_with_files_is_refused(series):
     folder, _ = series
     with pytest.raises(ConfigError, match="is not empty"):
-        ParaviewWriter(gymnasium.make("SoftGym/FingerReach-v0").unwrapped.robot, folder)
+        ParaviewWriter(gymnasium.make("SoftGym/FingerReach-v0").unwrapped, folder)
 
 
 class Balloon(Robot):
@@ -88,7 +88,7 @@ class Balloon(Robot):
 
 def test_chambers_carry_their_pressure_and_are_seen(tmp_path, monkeypatch):
     env = gymnasium.make("SoftGym/Reach-v0", robot=Balloon, backend="fem", render_mode="rgb_array")
-    with ParaviewWriter(env.unwrapped.robot, tmp_path / "series") as writer:
+    with ParaviewWriter(env.unwrapped, tmp_path / "series") as writer:
         watch_rollout(env, lambda observation, body: np.ones(1), [writer], seed=0, steps=1)
     state = env.unwrapped.state
     walls = pyvista.read(tmp_path / "series" / "chambers" / "0001.vtp")

@@ -8,15 +8,51 @@ import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from softgym_envs.extras import require
 from softgym_envs.storage import atomic_write
+from softgym_envs.viewer.moment import Moment
+
+if TYPE_CHECKING:
+    from softgym_envs.envs.env import SoftRobotEnv
 
 FORMATS = (".gif", ".webp", ".mp4")
 """Allowed file endings."""
 GIF_COLORS = 128
+
+
+class FilmWriter:
+    """Writes pictures of one rollout as a film; a context manager: the file does not exist if the block fails.
+
+    Args:
+        env: environment with ``render_mode="rgb_array"``.
+        path: the film, see `write_video`.
+
+    Raises:
+        ValueError: as `write_video`.
+        MissingLibrary: as `write_video`.
+    """
+
+    def __init__(self, env: SoftRobotEnv, path: str | Path) -> None:
+        self.env, self.path = env, check_video(path)
+        self._frames: list[Any] = []
+
+    def __enter__(self) -> FilmWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            write_video(self.path, self._frames, fps=self.env.metadata["render_fps"])
+
+    def log(self, moment: Moment, /) -> None:
+        """Draw the environment as it is now."""
+        self._frames.append(self.env.render())
 
 
 def write_video(path: str | Path, frames: Sequence[np.ndarray], fps: float = 20.0) -> Path:

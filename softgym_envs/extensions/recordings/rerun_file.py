@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING
 
-import gymnasium
 import numpy as np
 
-from softgym_envs.envs.env import SoftRobotEnv
 from softgym_envs.envs.tasks.base import LENGTHS, DistanceScale
 from softgym_envs.extras import require
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Robot
 from softgym_envs.storage import atomic_write
 from softgym_envs.units import display, effort_unit
-from softgym_envs.viewer.moment import Moment, Watcher
+from softgym_envs.viewer.moment import Moment
 from softgym_envs.viewer.scene import COLORS, STUB, effort_color
 from softgym_envs.viewer.surface import BodySurface, ShapeFinder, cable_lines
 
-Agent = Callable[[np.ndarray, SoftRobotEnv], np.ndarray]
-"""Maps an observation and the environment, unwrapped, to an action."""
+if TYPE_CHECKING:
+    from softgym_envs.envs.env import SoftRobotEnv
 
 
 class RolloutRecorder:
@@ -184,108 +182,7 @@ class RolloutRecorder:
         self._stream.log(f"{self._root}plots/{entity}", rerun.Scalars(float(value)))
 
 
-def record_rollout(
-    env: gymnasium.Env,
-    agent: Agent,
-    path: str | Path,
-    *,
-    seed: int | None = 0,
-    options: Mapping[str, Any] | None = None,
-    steps: int | None = None,
-) -> dict[str, Any]:
-    """Run one episode, write it to an ``.rrd`` file and return its result.
-
-    Args:
-        env: a `SoftRobotEnv`, wrapped or not. It is reset first and not closed.
-        agent: maps an observation and ``env.unwrapped`` to an action.
-        path: file to write.
-        seed: seed of the reset.
-        options: options of the reset.
-        steps: largest number of steps; default: the time limit of the environment.
-
-    Returns:
-        ``return`` (sum of rewards), ``final_distance`` (as `Task.distance` returns it: [m] for positions), ``success``
-        at the last step, ``steps``, and ``distrust_codes``, the ``info["distrust"]`` of each state.
-
-    Raises:
-        ValueError: if the environment is not a `SoftRobotEnv`, or has no time limit while ``steps`` is None.
-    """
-    with recorder_of(env, path) as recorder:
-        return watch_rollout(env, agent, [recorder], seed=seed, options=options, steps=steps)
-
-
-def recorder_of(env: gymnasium.Env, path: str | Path) -> RolloutRecorder:
-    """Return a recorder of an environment's rollouts, to be used as a context manager.
-
-    Raises:
-        ValueError: if the environment is not a `SoftRobotEnv`.
-    """
+def recorder_of(env: SoftRobotEnv, path: str | Path) -> RolloutRecorder:
+    """Return a recorder of an environment's rollouts, to be used as a context manager."""
     name = Path(path).stem if env.spec is None else env.spec.id
-    body = _body_of(env)
-    return RolloutRecorder(body.robot, path, name=name, distance_scale=body.task.distance_scale)
-
-
-def _body_of(env: gymnasium.Env) -> SoftRobotEnv:
-    body = env.unwrapped
-    if not isinstance(body, SoftRobotEnv):
-        raise ValueError(f"only rollouts of a SoftRobotEnv can be recorded, got {type(body).__name__}")
-    return body
-
-
-def _limit(env: gymnasium.Env, steps: int | None) -> int:
-    limit = env.spec.max_episode_steps if steps is None and env.spec is not None else steps
-    if limit is None:
-        raise ValueError("the environment has no time limit; pass the largest number of steps as 'steps'")
-    return limit
-
-
-class Filmed:
-    """Watcher that keeps a picture of each state.
-
-    Args:
-        env: environment with ``render_mode="rgb_array"``.
-        frames: list that takes the pictures, shape (height, width, 3).
-    """
-
-    def __init__(self, env: gymnasium.Env, frames: list[Any]) -> None:
-        self.env, self.frames = env, frames
-
-    def log(self, moment: Moment, /) -> None:
-        """Draw the environment as it is now."""
-        self.frames.append(self.env.render())
-
-
-def watch_rollout(
-    env: gymnasium.Env,
-    agent: Agent,
-    watchers: Sequence[Watcher],
-    *,
-    seed: int | None = 0,
-    options: Mapping[str, Any] | None = None,
-    steps: int | None = None,
-) -> dict[str, Any]:
-    """Run one episode, show each of its states to all watchers and return its result; see `record_rollout`."""
-    steps = _limit(env, steps)
-    body = _body_of(env)
-    observation, info = env.reset(seed=seed, options=None if options is None else dict(options))
-
-    def log(step: int, reward: float | None) -> None:
-        path, goal = body.task.drawn_goals(body.state, body.path, body.goal)
-        moment = Moment(step, body.design, body.state, goal, path, reward, float(info["distance"]))
-        for watcher in watchers:
-            watcher.log(moment)
-
-    log(0, None)
-    total, step, over, distrust_codes = 0.0, 0, False, [int(info["distrust"])]
-    while step < steps and not over:
-        observation, reward, terminated, truncated, info = env.step(agent(observation, body))
-        step, total, over = step + 1, total + float(reward), terminated or truncated
-        distrust_codes.append(int(info["distrust"]))
-        log(step, float(reward))
-    return {
-        "return": total,
-        "final_distance": float(info["distance"]),
-        "success": bool(info["is_success"]),
-        "steps": step,
-        "distrust_codes": distrust_codes,
-    }
+    return RolloutRecorder(env.robot, path, name=name, distance_scale=env.task.distance_scale)
