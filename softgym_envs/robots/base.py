@@ -108,11 +108,8 @@ class Robot(ABC):
         learning: what surrogates know of the robot before they learn it.
         sensing: sensors inside the body; none by default.
         view: from where pictures show it.
-        mirrored_actuators: for each actuator, that on the other side of the body; None if it has no equal sides.
         made_of_beams: bodies are quadratic beams and rigid parts, moved by servos or chambers; finite elements step
             many of them at once.
-        body_frame: row of the model with the origin of the frame that carries the body, of robots that move about; its
-            directors follow. None for robots that are mounted.
         backends: backends of its own, ``"module:class"``, by the name that they replace or add.
         parts: the parts that `learning` names, where `assemble` shall use them: functions of a design and of gravity
             that return the options of the element; see `of_parts`.
@@ -134,9 +131,7 @@ class Robot(ABC):
     learning: Learning = Learning()
     sensing: Sensing = Sensing()
     view: View = View()
-    mirrored_actuators: tuple[int, ...] | None = None
     made_of_beams: bool = False
-    body_frame: int | None = None
     backends: Mapping[str, str] = {}
     parts: Mapping[str, Callable[[Mapping[str, float], np.ndarray], dict[str, Any]]] = {}
     design_boxes: Mapping[str, Mapping[str, tuple[float, float]]] = {}
@@ -210,34 +205,6 @@ class Robot(ABC):
         raise ValueError(
             f"robot '{self.name}' has no reference path: define reference_path, or pass task_options={{'path': points}}"
         )
-
-    def place(self, nodes: np.ndarray) -> np.ndarray:
-        """Return where a robot that moves about is [m], shape (3,): the origin of its `body_frame`.
-
-        Args:
-            nodes: positions of all rows of the model [m], shape (n, 3).
-        """
-        return nodes[self.body_frame]
-
-    def reference_gait(self) -> np.ndarray:
-        """Return the commands of one period of a plain gait, one for each control step, shape (p, n_a).
-
-        Raises:
-            ValueError: if the robot has none.
-        """
-        raise ValueError(f"robot '{self.name}' has no reference gait: define reference_gait")
-
-    def steered_gait(self, turn: float, gait: np.ndarray | None = None) -> np.ndarray:
-        """Return a gait, changed so that the robot turns, shape (p, n_a).
-
-        Args:
-            turn: from -1, to the right as fast as this gait can, over 0, straight ahead, to 1, to the left.
-            gait: commands of one period, shape (p, n_a); default the reference gait.
-
-        Raises:
-            ValueError: if the robot has none.
-        """
-        raise ValueError(f"robot '{self.name}' has no gait that turns: define steered_gait")
 
     def displacements(self, fractions: np.ndarray) -> np.ndarray:
         """Return the commands, shape (N, n_a), at which states are sampled, for points of the unit cube (N, n_a).

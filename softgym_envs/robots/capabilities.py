@@ -83,12 +83,14 @@ class View:
         turned: by a quarter about the vertical, so that the first of the axes points to the right instead.
         at_rest: pictures are framed by the robot at rest, since many commands have no static equilibrium, as with an
             object that can fall; otherwise also by where its actuators can take it.
+        follows: row of the model that the camera goes with, of robots that move about.
         way: how far it goes along x in an episode, which pictures are to show too [sizes of the robot].
     """
 
     axes: tuple[int, int, int] = (0, 1, 2)
     turned: bool = False
     at_rest: bool = False
+    follows: int | None = None
     way: float = 0.0
 
     @property

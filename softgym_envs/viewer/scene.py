@@ -312,7 +312,7 @@ class Scene:
 
     def _follow(self, model: MechanicalModel, x: np.ndarray) -> None:
         """Move the camera on with a robot that has gone out of the picture."""
-        row = self.robot.body_frame
+        row = self.robot.view.follows
         if self._ground is None or row is None:
             return
         beyond = max(float(x[row, 0] - model.nodes[row, 0]) - self.robot.view.way * self._length, 0.0)

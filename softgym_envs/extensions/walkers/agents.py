@@ -8,6 +8,7 @@ import numpy as np
 
 from softgym_envs.agents.policy import Policy
 from softgym_envs.errors import WeightsError
+from softgym_envs.extensions.walkers.robots.mobile import mobile
 
 STEERING = 1.5
 """Steering of a gait, over the angle from where the robot faces to its heading [1/rad]."""
@@ -37,7 +38,7 @@ class GaitAgent:
         """Return the action that leads towards the next command of the gait, shape (n_a,)."""
         robot, spaces = env.robot, env.spaces
         if self._clock is None:
-            gait = self.led(robot.reference_gait(), env)
+            gait = self.led(mobile(robot).reference_gait(), env)
             action: np.ndarray = spaces.action(gait[(env.steps + 1) % len(gait)], env.command)
             return action
         if self._clock.shape[1] != len(robot.actuators):
@@ -60,8 +61,8 @@ class SteerAgent(GaitAgent):
     title = "steered gait"
 
     def led(self, gait: np.ndarray, env: Any) -> np.ndarray:
-        row = env.robot.body_frame
+        robot = mobile(env.robot)
+        row = robot.body_frame
         forwards, left, _ = env.state.nodes[row + 1 : row + 4] @ env.observed_goal
         turn = float(np.clip(STEERING * np.arctan2(left, forwards), -1.0, 1.0))
-        led: np.ndarray = env.robot.steered_gait(turn, gait)
-        return led
+        return robot.steered_gait(turn, gait)

@@ -24,7 +24,7 @@ from softgym_envs.extensions.beams.rollout import roll_out_backend
 
 if TYPE_CHECKING:
     from softgym_envs.extensions.beams.solver.design import Neighbours
-    from softgym_envs.robots.base import Robot
+    from softgym_envs.extensions.walkers.robots.mobile import MobileRobot
 
 TIGHTNESS = 1.0
 """How fast commands follow those of the gait, in their rates over a distance to them of one rate."""
@@ -86,7 +86,7 @@ def check_compiled(config: TrainConfig, backend: object) -> None:
         raise ValueError(f"learner '{learner}' needs a motion on finite elements in compiled code: {why}")
 
 
-def resampled_gait(robot: Robot, period: int) -> np.ndarray:
+def resampled_gait(robot: MobileRobot, period: int) -> np.ndarray:
     """Return where a policy of another period should be after each step of the reference gait, shape (period, n_a).
 
     -1 and 1 are the ends of the ranges of the actuators.
@@ -100,7 +100,7 @@ def resampled_gait(robot: Robot, period: int) -> np.ndarray:
     return np.roll((resampled - middle) / half, -1, axis=0)
 
 
-def shift_of_sides(robot: Robot, gait: np.ndarray) -> int | None:
+def shift_of_sides(robot: MobileRobot, gait: np.ndarray) -> int | None:
     """Return by how many control steps one side does later what the other one does in a gait (p, n_a), or None."""
     if robot.mirrored_actuators is None:
         return None

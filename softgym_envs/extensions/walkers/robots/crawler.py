@@ -22,7 +22,8 @@ from softgym_envs.mechanics.contact.obstacles import Obstacle, Plane
 from softgym_envs.mechanics.elements.beams import Beam, Section
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.skins import tube_skin
-from softgym_envs.robots.base import Actuator, Robot
+from softgym_envs.extensions.walkers.robots.mobile import MobileRobot
+from softgym_envs.robots.actuator import Actuator
 from softgym_envs.robots.capabilities import View
 
 LEGS = {"front_left": (1.0, 1.0), "front_right": (1.0, -1.0), "rear_left": (-1.0, 1.0), "rear_right": (-1.0, -1.0)}
@@ -41,7 +42,7 @@ START = 0.95
 """Gap below the robot where the search for the equilibrium begins, in distances of contact."""
 
 
-class Crawler(Robot):
+class Crawler(MobileRobot):
     """A body with two legs in front and two behind, with a chamber in each, above a layer that hardly stretches.
 
     Growing chambers bend their parts downwards.
@@ -61,7 +62,6 @@ class Crawler(Robot):
     goal_axes = np.array([1.0, 1.0, 0.0])
     goal_tolerance = 0.01
     mirrored_actuators = (0, 2, 1, 4, 3)
-    view = View(turned=True, at_rest=True, way=0.3)
     workspace_scale = 0.04
 
     def __init__(
@@ -80,7 +80,7 @@ class Crawler(Robot):
             raise ValueError(f"friction = {friction} must be finite and positive")
         self.elements = elements
         self.friction = float(friction)
-        self.body_frame = 4 * elements
+        self.view = View(turned=True, at_rest=True, follows=4 * elements, way=0.3)
         self.design_space = DesignSpace(
             DesignVariable("body_length", 0.040, 0.080, 0.059, "m", "length of the body between the roots of the legs"),
             DesignVariable("leg_length", 0.030, 0.060, 0.0405, "m", "length of a leg"),

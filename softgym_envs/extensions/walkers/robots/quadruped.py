@@ -21,7 +21,8 @@ from softgym_envs.mechanics.elements.beams import Beam, Section
 from softgym_envs.mechanics.elements.rigid import box_inertia
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.skins import box_skin, tube_skin
-from softgym_envs.robots.base import Actuator, Robot
+from softgym_envs.extensions.walkers.robots.mobile import MobileRobot
+from softgym_envs.robots.actuator import Actuator
 from softgym_envs.robots.capabilities import View
 
 LEGS = {"front_left": (1.0, 1.0), "front_right": (1.0, -1.0), "rear_left": (-1.0, 1.0), "rear_right": (-1.0, -1.0)}
@@ -42,7 +43,7 @@ START = 0.95
 """Gap below the feet where the search for the equilibrium begins, in distances of contact."""
 
 
-class Quadruped(Robot):
+class Quadruped(MobileRobot):
     """A trunk on four legs of silicone with a chamber before and one behind the axis of each.
 
     Equal volumes stretch a leg, different ones bend it forwards or backwards.
@@ -58,12 +59,11 @@ class Quadruped(Robot):
     name = "quadruped"
     effectors = ("trunk",)
     size = 0.1
-    body_frame = 0
     made_of_beams = True
     goal_axes = np.array([1.0, 1.0, 0.0])
     goal_tolerance = 0.01
     mirrored_actuators = (2, 3, 0, 1, 6, 7, 4, 5)
-    view = View(turned=True, at_rest=True, way=2.0)
+    view = View(turned=True, at_rest=True, follows=0, way=2.0)
     workspace_scale = 0.04
 
     def __init__(

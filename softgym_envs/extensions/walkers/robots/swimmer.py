@@ -22,7 +22,8 @@ from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.elements.beams import Beam, Section
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.skins import tube_skin
-from softgym_envs.robots.base import Actuator, Robot
+from softgym_envs.extensions.walkers.robots.mobile import MobileRobot
+from softgym_envs.robots.actuator import Actuator
 from softgym_envs.robots.capabilities import View
 
 SEGMENTS = 4
@@ -37,7 +38,7 @@ STROKE = 3.5e-8
 """Volume by which its chambers change [m3]."""
 
 
-class Swimmer(Robot):
+class Swimmer(MobileRobot):
     """A tapered body with a chamber on each side of its axis in every segment, and a tail without.
 
     Opposite changes of the volumes of a segment bend it to one side; equal ones stretch it.
@@ -56,7 +57,6 @@ class Swimmer(Robot):
     goal_axes = np.array([1.0, 1.0, 0.0])
     goal_tolerance = 0.01
     mirrored_actuators = tuple(k ^ 1 for k in range(2 * SEGMENTS))
-    view = View(axes=(2, 0, 1), at_rest=True, way=0.2)
     workspace_scale = 0.04
 
     def __init__(
@@ -73,7 +73,7 @@ class Swimmer(Robot):
         if not (np.isfinite(viscosity) and viscosity > 0.0):
             raise ValueError(f"viscosity = {viscosity} Pa s must be finite and positive")
         self.elements = elements
-        self.body_frame = 4 * ((SEGMENTS + 1) * elements)
+        self.view = View(axes=(2, 0, 1), at_rest=True, follows=4 * ((SEGMENTS + 1) * elements), way=0.2)
         self.viscosity = float(viscosity)
         self.design_space = DesignSpace(
             DesignVariable("length", 0.100, 0.200, 0.150, "m", "length of the body"),

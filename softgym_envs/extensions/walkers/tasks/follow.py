@@ -21,7 +21,7 @@ class Bearing(Pose):
     """How the body stands and moves, and where it is told to go, as it sees it; and the efforts of the actuators.
 
     Args:
-        robot: a robot with a `body_frame`.
+        robot: what moves about.
 
     Attributes:
         direction: where it is told to go, shape (3,).
@@ -51,7 +51,7 @@ class Follow(Walk):
     body, one control step before it is rated.
 
     Args:
-        robot: a robot with a `body_frame` that touches the ground.
+        robot: a `MobileRobot` that touches the ground.
         turn: largest angle of a heading from the last one [rad].
         **options: those of `Walk`.
 
@@ -71,7 +71,7 @@ class Follow(Walk):
         if not 0.0 <= turn <= np.pi:
             raise ValueError(f"turn = {turn} rad is out of bounds; allowed: 0 to pi")
         self.turn = turn
-        self.sensors = self._bearing = Bearing(robot)
+        self.sensors = self._bearing = Bearing(self.robot)
 
     def sample(self, rng: Random, count: int, kinematics: Kinematics) -> Array:
         angle = np.cumsum(rng.uniform(-self.turn, self.turn, (count, HEADINGS)), axis=1)

@@ -11,7 +11,7 @@ import numpy as np
 from softgym_envs.backends.backend import State
 from softgym_envs.envs.arrays import Array
 from softgym_envs.envs.tasks.base import DistanceScale, Kinematics, Random, Sensors, Task
-from softgym_envs.robots.base import Robot
+from softgym_envs.extensions.walkers.robots.mobile import MobileRobot
 from softgym_envs.units import effort_unit, present
 
 SHORTEST = 1.0
@@ -44,7 +44,7 @@ class Pose(Sensors):
     """How the body stands and moves, and the efforts of the actuators.
 
     Args:
-        robot: a robot with a `body_frame`.
+        robot: what moves about.
 
     Attributes:
         signs: of the readings of the body, as its mirror image across the plane of x and z has them.
@@ -52,8 +52,7 @@ class Pose(Sensors):
 
     signs: tuple[int, ...] = (1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1)
 
-    def __init__(self, robot: Robot) -> None:
-        assert robot.body_frame is not None
+    def __init__(self, robot: MobileRobot) -> None:
         self.frame, self.size = robot.body_frame, robot.size
         self.effort_scale = np.asarray(robot.effort_scale, dtype=float)
         unit = robot.actuators[0].unit
@@ -125,7 +124,7 @@ class Locomotion(Task):
     never add up to more than the way ahead: whoever rocks or turns on the spot gains nothing.
 
     Args:
-        robot: a robot with a `body_frame`.
+        robot: what moves about.
         pace: speed of the goal [sizes of the robot per second].
         charges: what each term of the reward besides the speed costs, by its name.
 
@@ -139,7 +138,9 @@ class Locomotion(Task):
     distance_scale = DistanceScale("shortfall", "mm/s", 1e3, goal_unit="m/s")
     tallies: tuple[str, ...] = ("speed", "drift", "power")
 
-    def __init__(self, robot: Robot, *, pace: float, **charges: float) -> None:
+    robot: MobileRobot
+
+    def __init__(self, robot: MobileRobot, *, pace: float, **charges: float) -> None:
         super().__init__(robot)
         if not 0.0 < pace < np.inf:
             raise ValueError(f"pace = {pace} sizes per second must be positive and finite")

@@ -11,6 +11,7 @@ from softgym_envs.envs.tasks.base import Load, check_force
 from softgym_envs.extensions.walkers.tasks.locomotion import Locomotion
 from softgym_envs.mechanics.contact.contact import Contacts
 from softgym_envs.quantities import QUANTITIES, check_quantity
+from softgym_envs.extensions.walkers.robots.mobile import MobileRobot
 from softgym_envs.robots.base import Robot
 from softgym_envs.robots.checks import plausible_mass
 
@@ -50,7 +51,7 @@ class Walk(Locomotion):
     is charged in proportion to the weight of the robot.
 
     Args:
-        robot: a robot with a `body_frame` that touches the ground.
+        robot: a `MobileRobot` that touches the ground.
         pace: speed of the goal [sizes of the robot per second].
         slip: charge for the speed of slipping.
         drift: charge for the speed sideways.
@@ -83,7 +84,7 @@ class Walk(Locomotion):
         friction: float | Sequence[float] | None = None,
         slope: float | Sequence[float] = 0.0,
     ) -> None:
-        if robot.body_frame is None or not robot.may_touch:
+        if not isinstance(robot, MobileRobot) or not robot.may_touch:
             raise ValueError(f"task 'walk' needs a robot that moves about on the ground; '{robot.name}' does not")
         super().__init__(robot, pace=pace, slip=slip, drift=drift, work=work)
         if not 0.0 <= payload < np.inf:
