@@ -30,10 +30,10 @@ from softgym_envs.agents.policy import Policy
 from softgym_envs.backends import make_backend
 from softgym_envs.extensions.leaderboard import plots
 from softgym_envs.extensions.modules import MODULES
+from softgym_envs.extensions.recordings.films import write_video
 from softgym_envs.mechanics import Statics
 from softgym_envs.robots import ROBOTS
 from softgym_envs.viewer.image import ImageRenderer
-from softgym_envs.extensions.recordings.films import write_video
 
 # Share of the range of each actuator, for the actuated half of a robot's picture.
 COMMANDS: dict[str, tuple[float, ...]] = {

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.designs import DesignSpace, DesignVariable
+from softgym_envs.extensions.walkers.robots.mobile import MobileRobot
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.chamber import Chamber
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
@@ -21,7 +22,6 @@ from softgym_envs.mechanics.elements.beams import Beam, Section
 from softgym_envs.mechanics.elements.rigid import box_inertia
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.skins import box_skin, tube_skin
-from softgym_envs.extensions.walkers.robots.mobile import MobileRobot
 from softgym_envs.robots.actuator import Actuator
 from softgym_envs.robots.capabilities import View
 

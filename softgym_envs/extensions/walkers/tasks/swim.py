@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from softgym_envs.extensions.walkers.tasks.locomotion import Locomotion
 from softgym_envs.extensions.walkers.robots.mobile import MobileRobot
+from softgym_envs.extensions.walkers.tasks.locomotion import Locomotion
 from softgym_envs.robots.base import Robot
 
 

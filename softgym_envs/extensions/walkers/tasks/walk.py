@@ -8,10 +8,10 @@ import numpy as np
 
 from softgym_envs.backends.backend import Ground, State
 from softgym_envs.envs.tasks.base import Load, check_force
+from softgym_envs.extensions.walkers.robots.mobile import MobileRobot
 from softgym_envs.extensions.walkers.tasks.locomotion import Locomotion
 from softgym_envs.mechanics.contact.contact import Contacts
 from softgym_envs.quantities import QUANTITIES, check_quantity
-from softgym_envs.extensions.walkers.robots.mobile import MobileRobot
 from softgym_envs.robots.base import Robot
 from softgym_envs.robots.checks import plausible_mass
 
