@@ -44,14 +44,13 @@ LAYERS = [
         "softgym_envs.extensions.grasping",
         "softgym_envs.extensions.hardware",
         "softgym_envs.extensions.hybrid",
-        "softgym_envs.extensions.leaderboard",
         "softgym_envs.extensions.learners",
         "softgym_envs.extensions.measured",
         "softgym_envs.extensions.networks",
         "softgym_envs.extensions.sensing",
         "softgym_envs.extensions.walkers",
     },
-    {"softgym_envs.extensions.deployment"},
+    {"softgym_envs.extensions.deployment", "softgym_envs.extensions.leaderboard"},
     {"softgym_envs.extensions.modules"},
 ]
 LEVEL = {package: level for level, layer in enumerate(LAYERS) for package in layer}

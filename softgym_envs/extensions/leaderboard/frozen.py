@@ -109,9 +109,9 @@ def freeze(name: str) -> Path:
 def frozen_parts(definition: BenchmarkProblem, goals: Mapping[str, np.ndarray]) -> dict[str, str]:
     """Return the hash of each part of a problem that decides a score.
 
-    ``definition`` is the YAML file, ``physics`` the robot's options, mesh, actuators and box of designs and how far
-    ahead a moving goal is shown, ``weights`` the learned model, ``policy`` the shared policy, and ``goals`` the four
-    sets of goals.
+    ``definition`` is the YAML file, ``physics`` the robot's options, mesh, actuators and box of designs, how far ahead
+    a moving goal is shown and the plain gait of bodies that move, ``weights`` the learned model, ``policy`` the shared
+    policy, and ``goals`` the four sets of goals.
     """
     robot = definition.robot
     physics: dict[str, object] = {
@@ -123,6 +123,8 @@ def frozen_parts(definition: BenchmarkProblem, goals: Mapping[str, np.ndarray]) 
     task = definition.environment.make_task()
     if task.horizon > 1:
         physics["lookahead"] = task.lookahead
+    if definition.track == "E":
+        physics["gait"] = np.round(robot.reference_gait() / robot.rates, 6).tolist()
     parts = {
         "definition": _hash(definition.model_dump(mode="json", exclude={"title"}, exclude_unset=True)),
         "physics": _hash(physics),
@@ -226,9 +228,9 @@ class FrozenProblem:
 
     @property
     def training_goals(self) -> np.ndarray:
-        """Goals of trainings [m], shape (k, 3); none for a task with paths."""
-        training = self.goals["training"]
-        return training[:, 0] if training.shape[1] == 1 else np.zeros((0, 3))
+        """Goals of trainings [m], shape (k, 3); none for a task with paths, or where the task draws them."""
+        training, drawn = self.goals["training"], self.definition.goals["training"].source == "task"
+        return training[:, 0] if training.shape[1] == 1 and not drawn else np.zeros((0, 3))
 
     @cached_property
     def test_keys(self) -> frozenset[str]:

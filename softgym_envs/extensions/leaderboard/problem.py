@@ -36,6 +36,7 @@ TRACKS = {
     "B": "design and control",
     "C": "several objectives",
     "D": "transfer: the test goals lie where no search goal does",
+    "E": "bodies that move, each with a gait of its own",
 }
 """Track of a problem -> what it asks for."""
 
@@ -72,7 +73,7 @@ class BenchmarkProblem(StudyProblem):
     """
 
     name: str = Field(pattern=r"^[a-z][a-z0-9-]*-v[1-9][0-9]*$")
-    track: Literal["A", "B", "C", "D"]
+    track: Literal["A", "B", "C", "D", "E"]
     judge: Judge = "qp"
     policy: Annotated[str | None, BesideConfig()] = None
     training: TrainingConfig = Field(default_factory=TrainingConfig)
@@ -95,7 +96,8 @@ class BenchmarkProblem(StudyProblem):
     @property
     def judges(self) -> tuple[Judge, ...]:
         """The judges that are available for this problem."""
-        trains = self.environment.batched and self.environment.backend == "surrogate"  # within seconds
+        fast = self.environment.batched and self.environment.backend == "surrogate"
+        trains = fast or self.judge == "trained"  # within seconds
         return tuple(
             judge
             for judge in JUDGES
@@ -229,10 +231,12 @@ class JudgedEvaluator:
                 start = initial or problem.policy
                 agent = train(config, Path(keep or folder) / "policy", initial=start, progress=False)
                 result.environment_steps += self.training_steps(share)
+                if problem.environment.backend == "fem":
+                    result.fem_solves += self.training_steps(share)
             found = assess(agent, problem, tested, goals, design)
             rate(result, problem, found)
             result.environment_steps += found.evaluation.steps
-            result.fem_solves = found.evaluation.steps if tested.backend == "fem" else 0
+            result.fem_solves += found.evaluation.steps if tested.backend == "fem" else 0
             if broken := problem.violations_text(result.values, problem.constraints):
                 result.reason, result.scores = broken, []
         return result

@@ -286,6 +286,8 @@ METHODS: dict[str, Callable[[FrozenProblem, int], Optimiser]] = {
     "map_elites": _own("packages", "QualityDiversityOptimiser", emitter="map_elites"),
     "cma_me": _own("packages", "QualityDiversityOptimiser", emitter="cma_me"),
     "gradient": _own("descents", "GradientOptimiser"),
+    "together": _own("together", "TogetherOptimiser", way="ascend"),
+    "evolution": _own("together", "TogetherOptimiser", way="evolve"),
     "critic": _own("joint", "JointOptimiser", proposer="critic"),
     "distribution": _own("joint", "JointOptimiser", proposer="distribution"),
     "inheritance": _own("joint", "InheritanceOptimiser"),
@@ -294,7 +296,18 @@ METHODS: dict[str, Callable[[FrozenProblem, int], Optimiser]] = {
 }
 """Baselines: name -> function of problem and seed. A new one is one row."""
 
-SINGLE_OBJECTIVE = ("cmaes", "smac", "map_elites", "cma_me", "gradient", "inheritance", "halving", "hyperband")
+SINGLE_OBJECTIVE = (
+    "cmaes",
+    "smac",
+    "map_elites",
+    "cma_me",
+    "gradient",
+    "together",
+    "evolution",
+    "inheritance",
+    "halving",
+    "hyperband",
+)
 """Methods that know a single objective only."""
 
 

@@ -12,6 +12,7 @@ from softgym_envs.extensions.leaderboard import Search, load_problem, problem_na
 from softgym_envs.extensions.leaderboard.frozen import freeze, load_definition
 from softgym_envs.extensions.leaderboard.problem import GOAL_SETS, TRACKS, JudgedScore, goal_key
 from softgym_envs.extensions.leaderboard.search import METHODS, BudgetSpent, make_optimiser, solve
+from softgym_envs.extensions.leaderboard.together import MOTIONS
 from tests.extensions.leaderboard.conftest import tiny_definition
 
 NAMES = problem_names()
@@ -104,10 +105,11 @@ def test_an_evaluation_counts_what_it_costs(tiny):
 
 
 JOINT = ("critic", "distribution")
+TOGETHER = ("together", "evolution")
 PACKAGES = {"botorch": "botorch", "smac": "smac", "map_elites": "ribs", "cma_me": "ribs"}
 
 
-@pytest.mark.parametrize("method", [method for method in METHODS if method not in JOINT])
+@pytest.mark.parametrize("method", [method for method in METHODS if method not in JOINT + TOGETHER])
 def test_each_baseline_solves_and_repeats_itself(tiny, method):
     if method in PACKAGES:
         pytest.importorskip(PACKAGES[method])
@@ -124,6 +126,36 @@ def test_each_baseline_solves_and_repeats_itself(tiny, method):
     assert found[0].best.score == max(row.score for row in whole)
     with pytest.raises(BudgetSpent, match=r"the budget 'small' is spent \(environment_steps = 7"):
         found[0].evaluate(tiny.definition.baseline_values)
+
+
+@pytest.mark.parametrize("method", TOGETHER)
+def test_body_and_gait_are_searched_together_and_the_judge_gives_another_gait(method, monkeypatch):
+    monkeypatch.setitem(MOTIONS, "ascend", 2)
+    monkeypatch.setitem(MOTIONS, "evolve", 15)  # one generation of 14
+    problem, found = load_problem("swimmer-swim-v1"), []
+    for _ in range(2):
+        optimiser = make_optimiser(method, problem, 0)
+        found.append(optimiser.ask())
+        steps, seconds = optimiser.take_charge()
+        assert steps == 60 * {"together": 2, "evolution": 14}[method] and seconds > 0.0
+        assert optimiser.take_charge() == (0, 0.0)
+    assert found[0] == found[1] and set(found[0]) == set(problem.variables)
+    search = Search(problem, limit=2)
+    solve(search, optimiser)  # one more search, of the motions that are left for it
+    first, second = search.ledger
+    assert first.environment_steps == first.fem_solves == second.fem_solves == 1_200 + 100 + 100
+    assert second.environment_steps == 1_400 + {"together": 60, "evolution": 0}[method]
+    assert problem.evaluate(second.design).scores == second.scores  # its own gait is forgotten
+    with pytest.raises(ValueError, match=r"learner 'analytic' has no gait .*; allowed: gait"):
+        make_optimiser(method, load_problem("finger-control-v1"), 0)
+
+
+def test_bodies_that_move_are_judged_by_the_plain_gait_or_by_their_own():
+    definition = load_definition("swimmer-swim-v1")
+    assert definition.judges == ("qp", "trained")
+    problem = load_problem("swimmer-swim-v1")
+    plain, own = (problem.evaluate(definition.baseline_values, judge=judge).score for judge in definition.judges)
+    assert own > 2.0 * plain > 0.0
 
 
 def test_points_of_the_unit_box(tiny):

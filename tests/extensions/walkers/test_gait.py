@@ -38,9 +38,22 @@ def test_the_gradient_is_that_of_the_way(monkeypatch):
 
     rng = np.random.default_rng(0)
     for _ in range(3):
-        direction = learner._straight(rng.normal(size=start.shape))
+        direction = learner.straight(rng.normal(size=start.shape))
         difference = (value(start + 1e-6 * direction) - value(start - 1e-6 * direction)) / 2e-6
         assert (gradient * direction).sum() == pytest.approx(difference, rel=1e-4)
+
+
+def test_the_gradient_is_that_of_the_charge_for_efforts(monkeypatch):
+    swim = EnvironmentConfig(id="SoftGym/SwimmerSwim-v0")
+    learner = GaitLearner(config(40, swim, gait={"period": 20, "periods": 2, "largest_effort": 3e4}))
+    monkeypatch.setattr(learner.backend._dynamics, "tolerance", 1e-11)
+    start, found = learner.gait, learner.climb()
+    assert found.value < 0.0 < found.way  # the charge counts
+    direction, values = learner.straight(np.random.default_rng(0).normal(size=start.shape)), []
+    for sign in (1.0, -1.0):
+        learner.gait = start + sign * 1e-6 * direction
+        values.append(learner.move().value)
+    assert (found.by_gait * direction).sum() == pytest.approx((values[0] - values[1]) / 2e-6, rel=1e-4)
 
 
 def test_both_sides_do_the_same_in_turns():

@@ -20,7 +20,7 @@ from softgym_envs.agents.learners.base import Learner, Tensors, check_weights
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.config import Config
 from softgym_envs.errors import ConvergenceError
-from softgym_envs.extensions.beams.rollout import roll_out_backend
+from softgym_envs.extensions.beams.rollout import Rollout, roll_out_backend
 
 if TYPE_CHECKING:
     from softgym_envs.extensions.beams.solver.design import Neighbours
@@ -33,8 +33,8 @@ SHORTER, LONGER = 0.4, 1.5
 FORGET, FORGET_SQUARES = 0.8, 0.95
 """Memory of the mean and of the mean square of gradients (Kingma and Ba 2015), short for a search of a few steps."""
 
-KEPT = {"gait": "gait", "best": "best", "slope": "_slope", "mean": "_mean", "square": "_square"}
-"""Arrays of an unfinished search, by their attributes."""
+EXCESS = 100.0
+"""Charge for the squares of efforts beyond their limit, over it, in sizes of the robot: far more than they gain."""
 
 
 class GaitConfig(Config):
@@ -50,6 +50,30 @@ class GaitConfig(Config):
     spread: float = Field(
         default=0.05, ge=0, description="by which the seed moves the start away from the reference gait, in half ranges"
     )
+    largest_effort: float | None = Field(
+        default=None, gt=0, description="of an actuator [SI]; the search charges for what is beyond"
+    )
+
+
+class Move(NamedTuple):
+    """A motion, and what its derivatives are made of.
+
+    Attributes:
+        way: ahead after the first period [m].
+        value: way ahead less the charges for the way sideways and for efforts beyond their limit [m].
+        rollout: the motion.
+        by_x: derivative of the value by the places, for `Rollout.gradient`.
+        by_effort: likewise by the efforts; None without a limit.
+        follow, pull: derivatives of `GaitLearner.commands`.
+    """
+
+    way: float
+    value: float
+    rollout: Rollout
+    by_x: np.ndarray
+    by_effort: np.ndarray | None
+    follow: np.ndarray
+    pull: np.ndarray
 
 
 class Climb(NamedTuple):
@@ -59,13 +83,60 @@ class Climb(NamedTuple):
         way: ahead after the first period [m].
         by_gait: derivative by the gait, shape (p, n_a).
         by_design: by the design variables, shape (d,); none where no neighbours of the body were given.
-        value: way ahead less the charge for the way sideways [m].
+        value: way ahead less the charges for the way sideways and for efforts beyond their limit [m].
     """
 
     way: float
     by_gait: np.ndarray
     by_design: np.ndarray
     value: float
+
+
+class Ascent:
+    """Steps of Adam towards larger values (Kingma and Ba 2015), in a box of -1 to 1.
+
+    A step that led to a smaller value is made again from the best point so far, shorter.
+
+    Args:
+        start: first point.
+
+    Attributes:
+        point: that is tried next.
+        best: best point so far.
+        value: of the best point.
+    """
+
+    ARRAYS = ("point", "best", "slope", "mean", "square")
+
+    def __init__(self, start: np.ndarray) -> None:
+        self.point = self.best = start
+        self.value, self.stride, self.count = -np.inf, 1.0, 0
+        self.slope, self.mean, self.square = (np.zeros_like(start) for _ in range(3))
+
+    def step(self, value: float | None, slope: np.ndarray | None, rate: float) -> None:
+        """Make the next point from the value of the present one and its slope; none if it cannot be computed.
+
+        Args:
+            value: of the present point.
+            slope: derivative of the value by the point.
+            rate: first step of a coordinate.
+        """
+        if value is not None and slope is not None and value > self.value:
+            self.value, self.stride = value, min(LONGER * self.stride, 1.0)
+            self.best, self.slope = self.point, slope
+            self.count += 1
+            self.mean = FORGET * self.mean + (1.0 - FORGET) * self.slope
+            self.square = FORGET_SQUARES * self.square + (1.0 - FORGET_SQUARES) * self.slope**2
+        elif not self.count:  # the first one cannot be computed
+            self.point = self.best = 0.8 * self.point
+            return
+        else:
+            self.stride *= SHORTER
+            self.count, self.mean = 1, (1.0 - FORGET) * self.slope
+            self.square = (1.0 - FORGET_SQUARES) * self.slope**2
+        size = np.sqrt(self.square / (1.0 - FORGET_SQUARES**self.count)) + 1e-15
+        ahead = self.mean / (1.0 - FORGET**self.count) / size
+        self.point = np.clip(self.best + self.stride * rate * ahead, -1.0, 1.0)
 
 
 def check_compiled(config: TrainConfig, backend: object) -> None:
@@ -132,8 +203,7 @@ class GaitLearner(Learner):
         config: configuration of the training; the environment has one body, and ``num_envs`` has no effect.
 
     Attributes:
-        gait: the commands of a period that are tried next, -1 and 1 at the ends of the ranges, shape (p, n_a).
-        best: those of the best gait so far, which a policy has, shape (p, n_a).
+        ascent: the search.
         ways: way ahead of each motion so far after its first period [m].
 
     Raises:
@@ -156,11 +226,23 @@ class GaitLearner(Learner):
         start = resampled_gait(robot, config.settings.period)
         noise = np.random.default_rng(config.seed).normal(size=start.shape)
         self._shift = shift_of_sides(robot, start)
-        self.gait = np.clip(start + config.settings.spread * self._straight(noise), -1.0, 1.0)
+        self.ascent = Ascent(np.clip(start + config.settings.spread * self.straight(noise), -1.0, 1.0))
         self.step = 0
         self.ways: list[float] = []
-        self.best, self._value, self._stride, self._count = self.gait, -np.inf, 1.0, 0
-        self._slope, self._mean, self._square = (np.zeros_like(self.gait) for _ in range(3))
+
+    @property
+    def gait(self) -> np.ndarray:
+        """Commands of a period that are tried next, -1 and 1 at the ends of the ranges, shape (p, n_a)."""
+        return self.ascent.point
+
+    @gait.setter
+    def gait(self, value: np.ndarray) -> None:
+        self.ascent.point = value
+
+    @property
+    def best(self) -> np.ndarray:
+        """Commands of the best gait so far, which a policy has, shape (p, n_a)."""
+        return self.ascent.best
 
     def learn(self, target: int, progress: Callable[[int], object]) -> None:
         settings = self.config.settings
@@ -169,33 +251,37 @@ class GaitLearner(Learner):
             try:
                 found = self.climb()
             except ConvergenceError:  # a gait that cannot be computed
-                self._ascend(None)
+                self.ascent.step(None, None, self.rate())
             else:
                 self.ways.append(found.way)
-                self._ascend(found)
+                self.ascent.step(found.value, found.by_gait, self.rate())
             self.step += steps
             progress(steps)
 
-    def _ascend(self, found: Climb | None) -> None:
-        """Make a step of Adam from the best gait so far; one that led to a worse gait is made again, shorter."""
-        settings = self.config.settings
-        if found is not None and found.value > self._value:
-            self._value, self._stride = found.value, min(LONGER * self._stride, 1.0)
-            self.best, self._slope = self.gait, found.by_gait
-            self._count += 1
-            self._mean = FORGET * self._mean + (1.0 - FORGET) * self._slope
-            self._square = FORGET_SQUARES * self._square + (1.0 - FORGET_SQUARES) * self._slope**2
-        elif not self._count:  # the first one cannot be computed
-            self.gait = self.best = 0.8 * self.gait
-            return
-        else:
-            self._stride *= SHORTER
-            self._count, self._mean = 1, (1.0 - FORGET) * self._slope
-            self._square = (1.0 - FORGET_SQUARES) * self._slope**2
-        size = np.sqrt(self._square / (1.0 - FORGET_SQUARES**self._count)) + 1e-15
-        share = min(self.step / self.config.steps, 1.0)
-        rate = self._stride * ((1.0 - share) * settings.learning_rate + share * settings.final_learning_rate)
-        self.gait = np.clip(self.best + rate * self._mean / (1.0 - FORGET**self._count) / size, -1.0, 1.0)
+    def rate(self) -> float:
+        """Return the first step of a command, in half ranges, at the present step of the search."""
+        settings, share = self.config.settings, min(self.step / self.config.steps, 1.0)
+        return (1.0 - share) * settings.learning_rate + share * settings.final_learning_rate
+
+    def move(self) -> Move:
+        """Move the body from rest.
+
+        Raises:
+            ConvergenceError: if a time step cannot be computed.
+        """
+        settings, backend, row = self.config.settings, self.backend, self.env.robot.body_frame
+        commands, follow, pull = self.commands(settings.period * settings.periods)
+        backend.reset()
+        parts = backend.steps.count
+        rollout = roll_out_backend(backend, commands)
+        begin, end = settings.period * parts - 1, len(commands) * parts - 1
+        way = rollout.x[end, row] - rollout.x[begin, row]
+        by_way = np.array([1.0, -settings.drift * np.sign(way[1]), 0.0])
+        by_x = np.zeros_like(rollout.x)
+        by_x[end, row], by_x[begin, row] = by_way, -by_way
+        charge, by_effort = self._excess(rollout.effort)
+        value = float(by_way @ way) - charge
+        return Move(float(way[0]), value, rollout, by_x, by_effort, follow, pull)
 
     def climb(self, neighbours: Neighbours | None = None) -> Climb:
         """Move the body from rest, and return how the gait should change.
@@ -206,31 +292,31 @@ class GaitLearner(Learner):
         Raises:
             ConvergenceError: if a time step cannot be computed.
         """
-        settings, backend, row = self.config.settings, self.backend, self.env.robot.body_frame
-        count, first = settings.period * settings.periods, settings.period
-        commands, follow, pull = self.commands(count)
-        backend.reset()
-        parts = backend.steps.count
-        rollout = roll_out_backend(backend, commands)
-        places = rollout.x[:, row]
-        begin, end = first * parts - 1, count * parts - 1
-        way = places[end] - places[begin]
-        by_way = np.array([1.0, -settings.drift * np.sign(way[1]), 0.0])
-        by_x = np.zeros_like(rollout.x)
-        by_x[end, row], by_x[begin, row] = by_way, -by_way
-        found = rollout.gradient(by_x=by_x, neighbours=neighbours)
+        moved, parts, period = self.move(), self.backend.steps.count, self.config.settings.period
+        found = moved.rollout.gradient(by_x=moved.by_x, by_effort=moved.by_effort, neighbours=neighbours)
         by_command = command_gradient(found.commands, parts)
         gradient, carried = np.zeros_like(self.gait), np.zeros(by_command.shape[1])
-        for k in reversed(range(count)):
+        for k in reversed(range(len(by_command))):
             carried = carried + by_command[k]
-            gradient[k % settings.period] += carried * pull[k]
-            carried = carried * follow[k]
-        return Climb(float(way[0]), self._straight(gradient), found.design, float(by_way @ way))
+            gradient[k % period] += carried * moved.pull[k]
+            carried = carried * moved.follow[k]
+        return Climb(moved.way, self.straight(gradient), found.design, moved.value)
+
+    def _excess(self, effort: np.ndarray) -> tuple[float, np.ndarray | None]:
+        """Return the charge for efforts (k, size) beyond their limit [m], and the derivatives of the value by them."""
+        limit, robot = self.config.settings.largest_effort, self.env.robot
+        if limit is None:
+            return 0.0, None
+        count = len(robot.actuators)
+        excess = np.maximum(np.abs(effort[:, :count]) / limit - 1.0, 0.0)
+        by_effort, scale = np.zeros_like(effort), EXCESS * robot.size / len(effort)
+        by_effort[:, :count] = -2.0 * scale * excess * np.sign(effort[:, :count]) / limit
+        return scale * float((excess**2).sum()), by_effort
 
     def _mirrored(self, gait: np.ndarray, shift: int) -> np.ndarray:
         return np.roll(gait, shift, axis=0)[:, list(self.env.robot.mirrored_actuators)]
 
-    def _straight(self, change: np.ndarray) -> np.ndarray:
+    def straight(self, change: np.ndarray) -> np.ndarray:
         """Return the part of a change of the gait (p, n_a) after which both sides still do the same."""
         return change if self._shift is None else 0.5 * (change + self._mirrored(change, self._shift))
 
@@ -269,19 +355,21 @@ class GaitLearner(Learner):
 
     def load_weights(self, tensors: Mapping[str, np.ndarray], path: Path) -> None:
         check_weights({"actor.clock": self.gait.shape}, tensors, path)
-        self.gait = self.best = tensors["actor.clock"].astype(float) / self._gain
+        self.ascent = Ascent(tensors["actor.clock"].astype(float) / self._gain)
 
     def state(self) -> tuple[Tensors, dict[str, Any]]:
-        kept = {name: getattr(self, attribute).copy() for name, attribute in KEPT.items()}
-        value = self._value if self._count else None
-        meta = {"step": self.step, "ways": self.ways, "value": value, "stride": self._stride, "count": self._count}
+        ascent = self.ascent
+        kept = {name: getattr(ascent, name).copy() for name in Ascent.ARRAYS}
+        value = ascent.value if ascent.count else None
+        meta = {"step": self.step, "ways": self.ways, "value": value, "stride": ascent.stride, "count": ascent.count}
         return kept, meta
 
     def restore(self, tensors: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:
-        for name, attribute in KEPT.items():
-            setattr(self, attribute, tensors[name].copy())
-        self.step, self.ways, self._count = int(meta["step"]), list(meta["ways"]), int(meta["count"])
-        self._value, self._stride = meta["value"] if self._count else -np.inf, float(meta["stride"])
+        ascent = self.ascent
+        for name in Ascent.ARRAYS:
+            setattr(ascent, name, tensors[name].copy())
+        self.step, self.ways, ascent.count = int(meta["step"]), list(meta["ways"]), int(meta["count"])
+        ascent.value, ascent.stride = meta["value"] if ascent.count else -np.inf, float(meta["stride"])
 
     def close(self) -> None:
         self.env.close()
