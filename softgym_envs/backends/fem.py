@@ -517,7 +517,7 @@ class FEMBackend(Backend):
         if learned and not equilibrium.stable:
             distrust |= SOFT
         if motion is None and learned:
-            held = np.abs(equilibrium.effort[slices["a"]]) < self.largest_efforts * SATURATED
+            held = ~equilibrium.slack & (np.abs(equilibrium.effort[slices["a"]]) < self.largest_efforts * SATURATED)
             uncertainty = float(np.linalg.norm(possible_errors(statics, held)[:3]))
             distrust |= SPREAD if uncertainty > self.robot.goal_tolerance else 0
         return State(

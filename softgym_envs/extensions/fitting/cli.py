@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -91,6 +92,11 @@ def _is_part(config: Path) -> bool:
     help="Number of states of each search for the worst trusted ones.",
 )
 @click.option("--seed", type=click.IntRange(0), default=11, show_default=True, help="Seed of all states.")
+@click.option(
+    "--tolerance",
+    type=click.FloatRange(0.0, min_open=True),
+    help="With --test of a robot of equal parts: trust uncertainties up to this [m] (default: the goal tolerance).",
+)
 @click.option("--kept-only", is_flag=True, help="Calibrate on what FOLDER holds of an interrupted run.")
 @click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Number of processes.")
 def calibrate_trust(
@@ -103,6 +109,7 @@ def calibrate_trust(
     states: int,
     adversarial_states: int,
     seed: int,
+    tolerance: float | None,
     kept_only: bool,
     workers: int,
 ) -> None:
@@ -113,13 +120,14 @@ def calibrate_trust(
     no trusted state that is off by more than the goal tolerance. The result is written to the card of the weights.
     Bodies of learned parts have no search, and those of the Tetrapod one command each.
 
-    With --test nothing is written: calibrated weights are judged as they are, on states of another --seed.
+    With --test nothing is written: calibrated weights are judged as they are, on states of another --seed. Robots of
+    equal parts are judged by their choices as well, such as the number of fingers.
     """
     from dataclasses import asdict
 
     from softgym_envs.extensions.fitting.calibration import calibrate, tested
     from softgym_envs.extensions.fitting.data.sampling import HasParts
-    from softgym_envs.extensions.fitting.within import calibrate_within
+    from softgym_envs.extensions.fitting.within import calibrate_within, tested_within
     from softgym_envs.surrogate.pretrained import pretrained_folder
 
     body = options.robot_of(robot, options_)
@@ -127,7 +135,9 @@ def calibrate_trust(
         raise click.UsageError(f"--test judges weights of whole robots; those of '{robot}' are of learned parts")
     if weights is None and not test:
         raise click.UsageError("--weights FOLDER is missing: a calibration writes to the card of the weights there")
-    weights = weights or pretrained_folder(body)
+    if tolerance is not None and not (test and isinstance(body, HasParts)):
+        raise click.UsageError("--tolerance is for --test of robots of equal parts, such as 'composed_gripper'")
+    weights = weights or pretrained_folder(body.one_part() if isinstance(body, HasParts) else body)
     if body.learning.parts:
         from softgym_envs.extensions.fitting.parts.calibration import calibrate_parts
 
@@ -135,12 +145,18 @@ def calibrate_trust(
         click.echo(json.dumps(found_of_parts, indent=2))
         return
     if isinstance(body, HasParts):
-        if test:
-            raise click.UsageError(f"--test judges weights of whole robots; those of '{robot}' are of its parts")
+        sizes: dict[str, Any] = {
+            "bodies": bodies,
+            "states": states,
+            "seed": seed,
+            "state_folder": folder,
+            "workers": workers,
+        }
         with nullcontext() if folder is None else options.resumable():
-            found = calibrate_within(
-                weights, body, bodies=bodies, states=states, seed=seed, state_folder=folder, workers=workers
-            )
+            if test:
+                found = tested_within(weights, body, tolerance=tolerance, **sizes)
+            else:
+                found = calibrate_within(weights, body, **sizes)
         click.echo(json.dumps({name: asdict(row) for name, row in found.items()}, indent=2))
         return
     with nullcontext() if folder is None else options.resumable():

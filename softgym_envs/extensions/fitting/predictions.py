@@ -49,6 +49,7 @@ class StratumReport:
         worst_trusted: largest error of a trusted state [m].
         lost: commands without an equilibrium on FEM; they do not count in any of the above.
         unsolved: those of them that are trusted.
+        missed: commands with an equilibrium on FEM that the model does not find; they do not count either.
     """
 
     states: int
@@ -59,6 +60,7 @@ class StratumReport:
     worst_trusted: float
     lost: int
     unsolved: int
+    missed: int
 
 
 def reached(model: SurrogateModel, context: Any, command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -106,4 +108,5 @@ def _report(every: Predictions, states: StratifiedStates, which: np.ndarray) -> 
         worst_trusted=float(every.error[rows & every.trusted].max(initial=0.0)),
         lost=int((which & ~states.found).sum()),
         unsolved=int((every.trusted & ~states.found & which).sum()),
+        missed=int((which & states.found & ~every.found).sum()),
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,16 +15,40 @@ from softgym_envs.extensions.fitting.data.strata import StratifiedStates, draw_c
 from softgym_envs.extensions.fitting.predictions import Predictions, StratumReport, by_stratum
 from softgym_envs.robots.base import Robot
 from softgym_envs.storage import write_json
+from softgym_envs.surrogate.domain import SPREAD
 
 
-def predict_within(folder: str | Path, whole: Robot, states: StratifiedStates) -> Predictions:
+def judged_within(
+    whole: Robot, bodies: int, states: int, seed: int, folder: str | Path | None = None, workers: int = 1
+) -> StratifiedStates:
+    """Return finite-element states of whole bodies in all strata.
+
+    Args:
+        whole: the robot of the bodies.
+        bodies: of each stratum.
+        states: commands of each body.
+        seed: of bodies and commands.
+        folder: where the states of each body are kept, so that an interrupted run continues.
+        workers: number of processes that solve bodies.
+    """
+    drawn = (draw_commands(whole, stratum, bodies, states, seed) for stratum in strata_of(whole, buckles=False))
+    return StratifiedStates.join(
+        [solve_commands(whole, commands, folder=folder, workers=workers) for commands in drawn]
+    )
+
+
+def predict_within(
+    folder: str | Path, whole: Robot, states: StratifiedStates, *, tolerance: float | None = None
+) -> Predictions:
     """Return what bodies of a learned part predict under the commands of judged states, each from rest.
 
     Args:
         folder: weights of the part.
         whole: the robot of the bodies, whose backend ``surrogate`` composes them.
         states: the same commands on finite elements.
+        tolerance: uncertainty up to which states are trusted [m]; default the goal tolerance.
     """
+    limit = whole.goal_tolerance if tolerance is None else tolerance
     error, uncertainty = np.full((2, len(states)), np.nan)
     trusted = np.zeros(len(states), dtype=bool)
     backend = make_backend("surrogate", whole, weights=folder)
@@ -38,7 +62,8 @@ def predict_within(folder: str | Path, whole: Robot, states: StratifiedStates) -
             except ConvergenceError:
                 continue
             error[row] = np.linalg.norm(found.effector.ravel()[:3] - states.effector[row, :3])
-            uncertainty[row], trusted[row] = found.uncertainty, found.trusted
+            uncertainty[row] = found.uncertainty
+            trusted[row] = not found.distrust & ~SPREAD and found.uncertainty <= limit
     kept = np.isfinite(uncertainty) & states.found
     return Predictions(error, uncertainty, uncertainty, trusted, np.ones(len(states)), kept)
 
@@ -70,11 +95,7 @@ def calibrate_within(
     Returns:
         How bodies of the calibrated part do on these states, by stratum.
     """
-    parts = [
-        solve_commands(whole, draw_commands(whole, stratum, bodies, states, seed), folder=state_folder, workers=workers)
-        for stratum in strata_of(whole, buckles=False)
-    ]
-    known, path = StratifiedStates.join(parts), Path(folder) / "model.json"
+    known, path = judged_within(whole, bodies, states, seed, state_folder, workers), Path(folder) / "model.json"
     card = json.loads(path.read_text())
     card["calibration"] = {"within": whole.name, "bodies": bodies, "states": states, "seed": seed, "inflation": 1.0}
     write_json(path, card)
@@ -85,4 +106,41 @@ def calibrate_within(
     found = by_stratum(predict_within(folder, whole, known), known)
     card["calibration"]["strata"] = {name: asdict(row) for name, row in found.items()}
     write_json(path, card)
+    return found
+
+
+def tested_within(
+    folder: str | Path,
+    whole: Robot,
+    *,
+    bodies: int = 64,
+    states: int = 5,
+    seed: int = 12,
+    state_folder: str | Path | None = None,
+    workers: int = 1,
+    tolerance: float | None = None,
+) -> dict[str, StratumReport]:
+    """Return how bodies of a calibrated part do on states that its calibration has not seen; its card stays as it is.
+
+    Args: as for `calibrate_within`, and ``tolerance`` as for `predict_within`.
+
+    Returns:
+        By stratum, then for each choice of the design, such as a number of fingers, in each stratum.
+
+    Raises:
+        ValueError: for the seed of the calibration.
+    """
+    card = json.loads((Path(folder) / "model.json").read_text())
+    if card.get("calibration", {}).get("seed") == seed:
+        raise ValueError(f"seed = {seed} is that of the calibration of '{folder}': choose another one")
+    known = judged_within(whole, bodies, states, seed, state_folder, workers)
+    every = predict_within(folder, whole, known, tolerance=tolerance)
+    found = by_stratum(every, known)
+    for column, name in enumerate(whole.design_space.names):
+        if (variable := whole.design_space[name]).choices:
+            labels = [
+                f"{stratum}, {name} {variable.choice(value)}"
+                for stratum, value in zip(known.stratum, known.design[:, column], strict=True)
+            ]
+            found |= by_stratum(every, replace(known, stratum=np.array(labels)))
     return found

@@ -28,7 +28,8 @@ DRAWN = ("inside", "faces", "corners", "slack corners", "near buckling")
 
 * ``inside``: bodies and commands anywhere in their boxes;
 * ``faces``: one design variable at its bound;
-* ``corners``: bodies at vertices of the design box, any commands;
+* ``corners``: bodies at vertices of the design box, any commands; what a variable chooses is drawn, since a choice has
+  no bounds;
 * ``slack corners``: bodies at vertices, commands at vertices at which some actuators pull all the way and others not at
   all; only for robots whose actuators cannot push;
 * ``near buckling``: bodies and commands from any of these whose actuators are expected to be softest; only for robots
@@ -164,7 +165,8 @@ def draw_commands(
     if stratum not in DRAWN:
         raise ValueError(f"stratum = {stratum!r} is unknown; allowed: {', '.join(map(repr, DRAWN))}")
     rng = np.random.default_rng([seed, DRAWN.index(stratum)])
-    space, names, count = robot.design_space.within(bounds or {}), learned_variables(robot), len(robot.actuators)
+    space, count = robot.design_space.within(bounds or {}), len(robot.actuators)
+    names = [name for name in learned_variables(robot) if not space[name].choices]
     if stratum == "near buckling":
         if softness is None:
             raise ValueError("states near buckling need an estimate of the softness")
