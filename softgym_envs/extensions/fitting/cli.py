@@ -10,7 +10,6 @@ from typing import Any
 import click
 
 from softgym_envs.cli import options
-from softgym_envs.wording import counted
 
 
 @click.command()
@@ -22,18 +21,14 @@ def dataset(config: Path, folder: Path, quiet: bool, overrides: tuple[str, ...])
     An interrupted run continues where it stopped.
     """
     from softgym_envs.config import load_config
-    from softgym_envs.extensions.fitting.parts.training import PartConfig, generate_part_data
-    from softgym_envs.extensions.fitting.training import FitConfig, generate_datasets
+    from softgym_envs.extensions.fitting.kinds import kind_of
 
-    if _is_part(config):
-        held = generate_part_data(load_config(config, PartConfig, overrides), folder)
-        click.echo(counted(len(held.body), "state"))
-        return
+    kind = kind_of(config)
+    wanted = load_config(config, kind.config, overrides)
     with options.resumable():
-        data = generate_datasets(load_config(config, FitConfig, overrides), folder, progress=not quiet)
-    for split, columns in data.items():
-        states, bodies = len(columns["rest"]), int(columns["rest"].sum())
-        click.echo(f"{split}: {counted(states, 'state')} of {counted(bodies, 'design')}")
+        lines = kind.data(wanted, folder, progress=not quiet)
+    for line in lines:
+        click.echo(line)
 
 
 @click.command()
@@ -47,31 +42,15 @@ def fit(config: Path, folder: Path, data: Path | None, quiet: bool, overrides: t
     stopped.
     """
     from softgym_envs.config import load_config
-    from softgym_envs.extensions.fitting.parts.training import PartConfig, fit_part
-    from softgym_envs.extensions.fitting.training import FitConfig, account
-    from softgym_envs.extensions.fitting.training import fit as run
-    from softgym_envs.robots.registry import make_robot
-    from softgym_envs.storage import read_json
+    from softgym_envs.extensions.fitting.kinds import kind_of
 
-    if _is_part(config):
-        part = load_config(config, PartConfig, overrides)
-        click.echo(json.dumps(fit_part(part, folder, data or folder / "data", progress=not quiet), indent=2))
-        return
-    wanted = load_config(config, FitConfig, overrides)
+    kind = kind_of(config)
+    wanted = load_config(config, kind.config, overrides)
     with options.resumable():
-        errors = run(wanted, folder, data or folder / "data", progress=not quiet)
+        errors = kind.fit(wanted, folder, data or folder / "data", progress=not quiet)
     click.echo(json.dumps(errors, indent=2))
-    click.echo("errors of the effector are in metres, all others are shares (1 is 100%)", err=True)
-    robot = make_robot(wanted.robot, **wanted.robot_options)
-    for line in account(robot, read_json(folder / "model.json")):
+    for line in kind.account(wanted, folder):
         click.echo(line, err=True)
-
-
-def _is_part(config: Path) -> bool:
-    """Whether a configuration is that of a learned part, not of a whole robot."""
-    from softgym_envs.config import config_text, read_value
-
-    return "part" in (read_value(config_text(config)) or {})
 
 
 @click.command("calibrate-trust")

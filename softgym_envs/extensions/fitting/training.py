@@ -8,7 +8,6 @@ import json
 import operator
 import shutil
 import time
-from collections.abc import Mapping
 from dataclasses import asdict, astuple, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -20,12 +19,11 @@ from softgym_envs.config import BesideConfig, Config
 from softgym_envs.errors import ConfigError
 from softgym_envs.extensions.fitting.correction import fit_correction
 from softgym_envs.extensions.fitting.data.dataset import generate_dataset, lost
-from softgym_envs.extensions.fitting.data.sampling import HasParts, Lost, SamplingPlan
+from softgym_envs.extensions.fitting.data.sampling import HasParts, SamplingPlan
 from softgym_envs.extensions.fitting.data.states import full_compliance, stable_rows, training_states, with_images
 from softgym_envs.extensions.fitting.row_errors import RowErrors
 from softgym_envs.extensions.fitting.trainer import Trainer
 from softgym_envs.extras import require
-from softgym_envs.mechanics.condensation import effort_unit
 from softgym_envs.registry import Table
 from softgym_envs.robots.base import Robot
 from softgym_envs.robots.registry import make_robot
@@ -285,48 +283,6 @@ def trusted_part(model: SurrogateModel, data: dict[str, np.ndarray]) -> dict[str
         "reasons": {text: float(((code & n) > 0).mean()) for n, text in DISTRUST_REASONS.items() if (code & n).any()},
         "effort": np.abs(data["effort"]).max(axis=0).tolist(),
     }
-
-
-def account(robot: Robot, card: Mapping[str, Any]) -> list[str]:
-    """Return what a fit did, in sentences: states kept and lost, and where its model can be trusted.
-
-    Args:
-        robot: the robot.
-        card: of the weights.
-    """
-    lines = []
-    for split, states in card["states"].items():
-        left = Lost(*card.get("lost", {}).get(split, ()))
-        kinds = (
-            (left.bodies, "body", "that cannot be built or held"),
-            (left.commands, "command", "without an equilibrium"),
-            (left.states, "state", "outside the ranges of the actuators"),
-            (card["unstable_states_left_out"][split], "state", "too unstable to learn"),
-        )
-        parts = [f"{counted(n, name)} {why}" for n, name, why in kinds if n]
-        lines.append(f"{split}: {counted(states, 'state')}; lost: {', '.join(parts) or 'nothing'}")
-    found = card.get("trusted")
-    if found is None:
-        return lines
-    shares = np.array(found["effort"]) / robot.effort_scale
-    if (most := float(shares.max())) > 10.0:
-        actuator, largest = robot.actuators[int(shares.argmax())], found["effort"][int(shares.argmax())]
-        lines.append(
-            f"'{actuator.name}' needs up to {largest:.3g} {effort_unit(actuator.unit)}, {most:.0f} times its "
-            "effort_scale: do actuators fight each other? (`Robot.antagonists`, `softgym check`)"
-        )
-    tested = counted(int(card["test"]["states"]), "test state")
-    text = f"It can be trusted on {found['share']:.0%} of {tested} of new bodies"
-    if found["effector_p95"] is not None:
-        text += f", where 95 % of the errors of the effector are below {1e3 * found['effector_p95']:.2g} mm"
-    if found["elsewhere_p95"] is not None:
-        text += f"; elsewhere below {1e3 * found['elsewhere_p95']:.2g} mm"
-    lines.append(text + ".")
-    if reasons := ", ".join(f"{reason} {share:.0%}" for reason, share in found["reasons"].items()):
-        lines.append(f"Not trusted because of: {reasons}.")
-    if found["share"] < 0.5:
-        lines.append("Take more bodies (data.train.groups), narrower ranges, or fewer variables (data.vary).")
-    return lines
 
 
 def row_errors(model: SurrogateModel, data: dict[str, np.ndarray]) -> RowErrors:
@@ -594,3 +550,12 @@ def _correction(config: FitConfig, data: Datasets, features: Features) -> dict[s
         return None
     levels = [data[f"correction/{level}"] for level in ("coarser", "own", "finer")]
     return asdict(fit_correction(levels, config.correction.sizes, features.design(levels[1]["design"])))
+
+
+def describe_datasets(config: FitConfig, folder: Path, *, progress: bool = True) -> list[str]:
+    """Generate what is missing of the datasets of a surrogate, and return how many states there are, in lines."""
+    found = generate_datasets(config, folder, progress=progress)
+    return [
+        f"{name}: {counted(len(columns['rest']), 'state')} of {counted(int(columns['rest'].sum()), 'design')}"
+        for name, columns in found.items()
+    ]

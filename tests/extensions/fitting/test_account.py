@@ -6,7 +6,8 @@ import pytest
 
 from softgym_envs import make_robot
 from softgym_envs.errors import ConfigError
-from softgym_envs.extensions.fitting.training import FitConfig, account, generate_datasets
+from softgym_envs.extensions.fitting.account import account
+from softgym_envs.extensions.fitting.training import FitConfig, generate_datasets
 from softgym_envs.robots.soft_finger import SoftFinger
 
 SPLIT = {"groups": 2, "states": 2}

@@ -397,3 +397,15 @@ def test_shipped_weights(robot):
     assert states.force[0, 0, 0] < 0.0 < states.gap[0]
     assert stable[0]
     assert np.linalg.eigvalsh(0.5 * (W[0] + W[0].T))[0] > 0.0
+
+
+def test_the_verbs_of_surrogates_know_the_configuration_of_the_chain(softgym, tmp_path):
+    sizes = [f"data.{split}.groups=1" for split in ("train", "validation", "test")]
+    mesh = "robot_options={mesh_size: 0.02, element: linear}"
+    status, out, _ = softgym(
+        "dataset", "--config", "contact_aided_finger", "--folder", tmp_path, *sizes, mesh, "workers=1"
+    )
+    assert status == 0
+    assert out.splitlines() == [f"{split}: 1 state of 1 design" for split in ("train", "validation", "test")]
+    status, _, err = softgym("fit", "--config", "contact_aided_finger", "--folder", tmp_path, "robot=finger")
+    assert status == 2 and "robot: must be 'softgym_envs.extensions.grasping.chain.data:MarkedFinger'" in err

@@ -14,11 +14,13 @@ from pydantic import Field
 from softgym_envs.config import Config
 from softgym_envs.extensions.beams.parts.pose import PLACE, TURN, WEIGHT
 from softgym_envs.extensions.beams.parts.weights import LegDomain, card_of_leg, write_leg
+from softgym_envs.extensions.fitting.kinds import FitKind
 from softgym_envs.extensions.fitting.parts.data import LegStates, held_states, swing_poses
 from softgym_envs.extensions.fitting.trainer import Trainer, TrainingOptions
 from softgym_envs.extras import require
 from softgym_envs.runs import RunFolder
 from softgym_envs.storage import atomic_write
+from softgym_envs.wording import counted
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -260,3 +262,11 @@ def _digest(states: LegStates) -> str:
     for column in states:
         digest.update(np.ascontiguousarray(column).tobytes())
     return digest.hexdigest()
+
+
+def _describe_data(config: PartConfig, folder: Path, *, progress: bool = True) -> list[str]:
+    """Generate the states of a part if they are missing, and say how many there are."""
+    return [counted(len(generate_part_data(config, folder).body), "state")]
+
+
+KIND = FitKind(PartConfig, _describe_data, fit_part)

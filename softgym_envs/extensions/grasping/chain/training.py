@@ -17,10 +17,12 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 from pydantic import Field
 
+from softgym_envs.errors import DataError
 from softgym_envs.executors import parallel_map
 from softgym_envs.extensions.fitting.data.states import full_compliance
+from softgym_envs.extensions.fitting.kinds import FitKind
 from softgym_envs.extensions.fitting.trainer import History, Trainer, TrainingOptions
-from softgym_envs.extensions.fitting.training import FitConfig, generate_datasets
+from softgym_envs.extensions.fitting.training import FitConfig, describe_datasets, generate_datasets
 from softgym_envs.extensions.grasping.chain.body import FingerChain
 from softgym_envs.extensions.grasping.chain.closings import closing_errors, kept_closings, summary
 from softgym_envs.extensions.grasping.chain.model import ChainModel, depth_features, relative_stiffness, save_chain
@@ -48,10 +50,18 @@ class ChainConfig(FitConfig):
     """Configuration of a learned chain: data of `MarkedFinger` and the networks of the segments.
 
     Attributes:
+        chain: what is learned.
+        robot: that with the points at which the compliance is learned.
+        alone: False, because the servo has a largest torque, which chains know.
         closings: number of bodies of the validation set, and of the test set, that finite elements also close on
             objects.
     """
 
+    chain: Literal["contact_aided_finger"]
+    robot: Literal["softgym_envs.extensions.grasping.chain.data:MarkedFinger"] = (
+        "softgym_envs.extensions.grasping.chain.data:MarkedFinger"
+    )
+    alone: Literal[False] = False
     network: Options = Options()
     closings: int = Field(default=12, gt=0)
 
@@ -275,6 +285,11 @@ def fit_chain(
     model = ChainModel(chain.robot, tensors, {"domain": domain})
     found = closing_errors(model, finger, contact["validation"])
     trusted = np.isfinite(found.tip) & ~found.folded & found.known[:, None]
+    if not trusted.any():
+        raise DataError(
+            "the members agree on no closing of the validation bodies, so their errors cannot be calibrated: take more "
+            "bodies (data.train.groups, closings) or steps (network.steps)"
+        )
     domain["tip_inflation"] = float(np.quantile((found.tip / found.spread[:, None])[trusted], 0.95))
     errors |= {
         f"contact_{name}": value
@@ -293,3 +308,6 @@ def fit_chain(
     with atomic_write(folder / "history.npz") as stream:
         np.savez_compressed(stream, allow_pickle=False, **history)
     return errors
+
+
+KIND = FitKind(ChainConfig, describe_datasets, fit_chain)
