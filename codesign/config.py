@@ -179,6 +179,7 @@ class StudyConfig(StudyProblem):
                 metric.over_path,
                 f"{ends} knows the ends of episodes only, but '{name}' is a mean over the steps{allowed}",
             )
+        robot.needs_displacements(ends)
         learner = self.training.learner
         refuse(
             LEARNERS[learner].has_memory and bool(self.plan.trains or self.finalists.seeds),

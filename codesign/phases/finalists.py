@@ -184,8 +184,7 @@ def _trained_policy(folder: StudyFolder, finalist: Finalist, seed: int) -> Path:
     update: dict[str, Any] = {"seed": training.seed + seed, "steps": steps}
     if initial is not None:  # its networks decide the architecture
         widths = Policy(initial).widths
-        own = getattr(training, training.learner)
-        update[training.learner] = own.model_copy(update={"net_arch": widths})
+        update["settings"] = training.settings.model_copy(update={"net_arch": widths})
     training = training.model_copy(update={**update, "report_every": min(training.report_every, steps)})
     name = training_name(finalist.trial, seed)
     place = folder.path / "finalists" / name

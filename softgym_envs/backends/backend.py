@@ -28,6 +28,9 @@ FAR_BEYOND = 10.0
 #: An effort of this many times the typical one of its actuator is taken for a mistake in its unit.
 STRONG = 100.0
 
+#: Mode of `Backend.step`: every actuator in the quantity that its robot commands.
+COMMANDED = "commanded"
+
 #: A force that would move the effector by this many sizes of its robot is taken for a mistake in its unit.
 FAR_MOVED = 10.0
 
@@ -188,18 +191,29 @@ def check_numbers(name: str, values: object, count: int) -> np.ndarray:
     return array
 
 
+def command_modes(robot: Robot, mode: str) -> tuple[str, ...]:
+    """Return what a command drives of each actuator, ``"displacement"`` or ``"effort"``, see `Backend.step`.
+
+    Raises:
+        ValueError: for an unknown mode.
+    """
+    choice("mode", mode, ("displacement", "effort", COMMANDED))
+    return robot.command_modes if mode == COMMANDED else (mode,) * len(robot.actuators)
+
+
 def check_command(robot: Robot, command: object, mode: str) -> np.ndarray:
-    """Return a command as an array (n_a,).
+    """Return a command as an array (n_a,); for the mode see `Backend.step`.
 
     Raises:
         ValueError: for an unknown mode, or unless it is one finite number for each actuator; also for a displacement
             so far beyond the range of its actuator, or an effort so far beyond what is typical of it, that its unit is
             probably wrong.
     """
-    choice("mode", mode, ("displacement", "effort"))
+    modes = command_modes(robot, mode)
     array = check_numbers("command", command, len(robot.actuators))
-    if mode == "effort":
-        for actuator, value, typical in zip(robot.actuators, array.tolist(), robot.effort_scale.tolist(), strict=True):
+    values, scales = array.tolist(), robot.effort_scale.tolist()
+    for actuator, kind, value, typical in zip(robot.actuators, modes, values, scales, strict=True):
+        if kind == "effort":
             if abs(value) > STRONG * typical:
                 check_quantity(
                     "pressure" if actuator.unit == "m3" else "force",
@@ -208,9 +222,7 @@ def check_command(robot: Robot, command: object, mode: str) -> np.ndarray:
                     high=STRONG * typical,
                     example=f"{STRONG:g} times effort_scale of robot '{robot.name}'",
                 )
-        return array
-    for actuator, value in zip(robot.actuators, array.tolist(), strict=True):
-        if abs(value) > FAR_BEYOND * max(abs(actuator.low), abs(actuator.high)):
+        elif abs(value) > FAR_BEYOND * max(abs(actuator.low), abs(actuator.high)):
             raise ValueError(
                 f"command = {value:g} {actuator.unit} of actuator '{actuator.name}' is far beyond its range of "
                 f"{actuator.low:g} to {actuator.high:g} {actuator.unit}; check its unit"
@@ -281,6 +293,7 @@ class Backend(ABC):
         moving: states have velocities.
         takes_force: `step` takes a force on the effector.
         takes_touch: `touch` takes a force on a point of the body.
+        commands_efforts: `step` takes actuators that their robot commands in effort.
         cable_friction: coefficient of friction of cables on their guides, 0 where they are not computed.
         cable_compliance: how far cables stretch per tension [m/N], 0 where that is not computed.
     """
@@ -288,6 +301,7 @@ class Backend(ABC):
     moving: bool = False
     takes_force: bool = False
     takes_touch: bool = False
+    commands_efforts: bool = False
     cable_friction: float = 0.0
     cable_compliance: Any = 0.0
     robot: Robot
@@ -318,12 +332,13 @@ class Backend(ABC):
         """
 
     @abstractmethod
-    def step(self, command: np.ndarray, mode: str = "displacement", *, force: np.ndarray | None = None) -> State:
+    def step(self, command: np.ndarray, mode: str = COMMANDED, *, force: np.ndarray | None = None) -> State:
         """Go from the current equilibrium to that under a command, shape (n_a,).
 
         Args:
             command: actuator displacements, or efforts.
-            mode: ``"displacement"`` or ``"effort"``. Efforts of actuators that cannot push must not be negative.
+            mode: ``"displacement"``, ``"effort"``, or ``"commanded"``: the quantity in which the robot commands each
+                actuator. Efforts of actuators that cannot push must not be negative.
             force: force on the first effector [N], shape (3,), or None.
 
         Raises:
@@ -331,7 +346,7 @@ class Backend(ABC):
             ValueError: for a malformed command.
         """
 
-    def probe(self, command: np.ndarray, mode: str = "displacement") -> State:
+    def probe(self, command: np.ndarray, mode: str = COMMANDED) -> State:
         """Return the state under a command without going there."""
         kept = self.state
         try:

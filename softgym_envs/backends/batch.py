@@ -81,7 +81,7 @@ class BatchState(Rows):
 
 
 class BatchBackend(ABC):
-    """Physics of B bodies of one robot, which go from state to state under commanded displacements.
+    """Physics of B bodies of one robot, which go from state to state under the commands of its actuators.
 
     Attributes:
         robot: the robot.
@@ -194,9 +194,18 @@ class BatchBackend(ABC):
 
 
 def condensed_gradient(
-    compliance: np.ndarray, a: slice, e: slice, follows: np.ndarray, effector: np.ndarray, effort: np.ndarray
+    compliance: np.ndarray,
+    a: slice,
+    e: slice,
+    follows: np.ndarray,
+    effector: np.ndarray,
+    effort: np.ndarray,
+    by_effort: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return what `BatchBackend.gradient` does, from ``W``.
+
+    A commanded effort adds to the pull of its own row, and moves what is held in displacement: with ``g`` the gradient
+    in the displacements of the held actuators ``T``, that in an effort of ``E`` is ``pull_E - W_ET g``.
 
     Args:
         compliance: of the states, shape (B, n, n).
@@ -206,10 +215,12 @@ def condensed_gradient(
             they are. Shape (B, n_a).
         effector: derivative of the function in the effector coordinates, shape (B, n_e).
         effort: derivative in the efforts, shape (B, n_a).
+        by_effort: actuators that are commanded in effort, shape (n_a,).
     """
-    W = compliance[:, a, a]
+    W, follows = compliance[:, a, a], follows & ~by_effort
     pulled = np.einsum("bea,be->ba", compliance[:, e, a], effector) + effort
     held = np.linalg.solve(W, pulled[:, :, None])[:, :, 0]
     both, unit = follows[:, :, None] & follows[:, None, :], np.eye(W.shape[1])
     driven = np.linalg.solve(np.where(both, W, unit), np.where(follows, pulled, 0.0)[:, :, None])[:, :, 0]
-    return held, np.where(follows, driven, 0.0)
+    driven = np.where(follows, driven, 0.0)
+    return held, np.where(by_effort, pulled - np.einsum("bij,bj->bi", W, driven), driven)

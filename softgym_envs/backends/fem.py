@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from softgym_envs.backends.backend import (
+    COMMANDED,
     Backend,
     Ground,
     PointForce,
@@ -17,6 +18,7 @@ from softgym_envs.backends.backend import (
     check_command,
     check_force,
     check_touch,
+    command_modes,
     drive_sizes,
 )
 from softgym_envs.backends.time_steps import TimeSteps, check_still
@@ -63,24 +65,26 @@ def _drifts(model: MechanicalModel) -> bool:
     )
 
 
-def _relax_dynamically(model: MechanicalModel, statics: Statics, command: np.ndarray) -> Equilibrium:
+def _relax_dynamically(
+    model: MechanicalModel, statics: Statics, command: np.ndarray, modes: Sequence[str]
+) -> Equilibrium:
     """Find an equilibrium that Newton's method misses, by a slow, heavily damped motion towards it."""
     from softgym_envs.mechanics.solvers.dynamics import Dynamics
 
     motion_solver = Dynamics(model, step=0.02, stiffness_damping=0.02, tolerance=1e-8)
     for _ in range(200):
-        motion = motion_solver.advance(command)
+        motion = motion_solver.advance(command, modes)
         if np.abs(motion.velocity).max() * model.kinematics.dof_scale.max() < 1e-3:
             break
     statics.restore(motion_solver.x, motion_solver.effort)
-    return statics.solve(command)
+    return statics.solve(command, modes)
 
 
 class FEMBackend(Backend):
     """States from finite elements: static equilibria with exact ``W``, or motion in time.
 
-    An actuator whose effort would exceed its ``max_effort`` is driven by that effort instead, until its command asks
-    for less.
+    An actuator that is commanded in displacement and would exceed its ``max_effort`` is driven by that effort instead,
+    until its command asks for less.
 
     Args:
         robot: the robot.
@@ -105,6 +109,7 @@ class FEMBackend(Backend):
     model: MechanicalModel
     takes_force = True
     takes_touch = True
+    commands_efforts = True
 
     def __init__(
         self,
@@ -137,7 +142,6 @@ class FEMBackend(Backend):
             "tolerance": 1e-9,
         }
         self.largest_efforts = np.array([actuator.max_effort for actuator in robot.actuators])
-        self._limited = bool(np.isfinite(self.largest_efforts).any())
         self._friction = self._checked_friction(cable_friction)
         self._compliance = self._checked_compliance(cable_compliance)
         self._ground = Ground()
@@ -169,7 +173,7 @@ class FEMBackend(Backend):
             self.design, self._own, self._own_loads = complete, own, loads
         self.touch(None)
         self.restore(self._rest)
-        self._mode = "displacement"  # mode of the current state's command
+        self._modes = self.robot.command_modes  # those of the current state's command
         return self.state
 
     def _settle(self, model: MechanicalModel) -> None:
@@ -179,9 +183,9 @@ class FEMBackend(Backend):
             rest = self._afloat(model, zero)
         else:
             try:
-                rest = statics.solve(zero)
+                rest = statics.solve(zero, self.robot.command_modes)
             except ConvergenceError:
-                rest = _relax_dynamically(model, statics, zero)
+                rest = _relax_dynamically(model, statics, zero, self.robot.command_modes)
         self._dynamics = self._mover(model) if self.moving else None
         self.model, self._statics = model, statics
         self._rest = self._state(rest, zero, still=True)
@@ -221,7 +225,7 @@ class FEMBackend(Backend):
         """Return the undeformed shape of a body that nothing holds, with the condensed model of a time step from it."""
         if not self.moving:
             raise ValueError(f"nothing holds robot '{self.robot.name}', so it has no equilibrium; pass dynamics=True")
-        moved = self._mover(model).advance(command).equilibrium
+        moved = self._mover(model).advance(command, self.robot.command_modes).equilibrium
         values = np.concatenate([constraint.value(model.nodes) for constraint, _ in model.rows])
         return replace(moved, x=model.nodes.copy(), delta=values, effort=np.zeros_like(moved.effort))
 
@@ -320,8 +324,8 @@ class FEMBackend(Backend):
         for cable in cables:
             cable.friction = self._friction
 
-    def step(self, command: np.ndarray, mode: str = "displacement", *, force: np.ndarray | None = None) -> State:
-        command = check_command(self.robot, command, mode)
+    def step(self, command: np.ndarray, mode: str = COMMANDED, *, force: np.ndarray | None = None) -> State:
+        command, modes = check_command(self.robot, command, mode), command_modes(self.robot, mode)
         load = None
         if force is not None:
             load = np.zeros(self.state.effector.size)
@@ -329,25 +333,25 @@ class FEMBackend(Backend):
         kept = self._motion
         try:
             if self._dynamics is None:
-                found = self._drive(self._statics, command, mode, load)
+                found = self._drive(self._statics, command, modes, load)
                 self.state = self._state(found, command)
             else:
-                self.state = self._advance(command, mode, load)
-            self._mode = mode
+                self.state = self._advance(command, modes, load)
+            self._modes = modes
         except BaseException:
             # Keep the current state, whatever stopped the step.
             self._go_back(kept)
             raise
         return self.state
 
-    def probe(self, command: np.ndarray, mode: str = "displacement") -> State:
+    def probe(self, command: np.ndarray, mode: str = COMMANDED) -> State:
         """Return the static equilibrium under a command, found from the present shape, without going there."""
         kept = self._motion
-        command = check_command(self.robot, command, mode)
+        command, modes = check_command(self.robot, command, mode), command_modes(self.robot, mode)
         try:
             if self._dynamics is not None:
                 self.restore(self.state)  # statics are where they were left before the last steps of the motion
-            return self._state(self._drive(self._statics, command, mode, None), command, still=True)
+            return self._state(self._drive(self._statics, command, modes, None), command, still=True)
         finally:
             self._go_back(kept)
 
@@ -405,21 +409,21 @@ class FEMBackend(Backend):
         command: np.ndarray,
         memory: ContactMemory | None = None,
     ) -> None:
-        """Go on from a state that another solver has found for the present body under commanded displacements.
+        """Go on from a state that another solver has found for the present body under commands.
 
         Args:
             x: nodes [m], shape (n, 3).
             effort: of all constraint rows, shape (size,).
             delta: their values, shape (size,).
             velocity: of the nodes [m/s], shape (n, 3).
-            command: displacements that led there, shape (n_a,).
+            command: commands that led there, shape (n_a,).
             memory: what friction remembers there; None for a body that touches nothing.
         """
         count, e = len(command), self.state.condensed.slices["e"]
         self._statics.restore(x, effort, memory=memory)
         if self._dynamics is not None:
             self._dynamics.restore(x, effort, velocity, memory=memory)
-        self._mode = "displacement"
+        self._modes = self.robot.command_modes
         self.state = replace(
             self._rest,
             command=command.copy(),
@@ -431,16 +435,16 @@ class FEMBackend(Backend):
             memory=memory,
         )
 
-    def _extra_state(self) -> tuple[str, tuple | None, PointForce | None, Ground]:
-        return self._mode, self._motion, self._touch, self._ground
+    def _extra_state(self) -> tuple[tuple[str, ...], tuple | None, PointForce | None, Ground]:
+        return self._modes, self._motion, self._touch, self._ground
 
     def _resume(self, snapshot: Snapshot) -> None:
-        self._mode, motion, touch, ground = snapshot.extra
+        self._modes, motion, touch, ground = snapshot.extra
         if ground != self._ground:
             self.stand_on(ground)
         self.reset(snapshot.design)
         self.state = snapshot.state
-        self._mode = snapshot.extra[0]  # a reset has changed it
+        self._modes = snapshot.extra[0]  # a reset has changed it
         self.touch(touch)
         self._go_back(motion)
 
@@ -455,40 +459,39 @@ class FEMBackend(Backend):
         if self._dynamics is not None and motion is not None:
             self._dynamics.snapshot = motion
 
-    def _advance(self, command: np.ndarray, mode: str, load: np.ndarray | None) -> State:
+    def _advance(self, command: np.ndarray, modes: Sequence[str], load: np.ndarray | None) -> State:
         assert self._dynamics is not None
         # Ramps start at the last command, which a saturated actuator has not reached.
-        start = self.state.effort
-        if mode == "displacement":
-            start = self.state.command if self._mode == mode else self.state.displacement
-        parts = self.steps.ramp(start, command)
-        aims = np.clip(parts, -self.largest_efforts, self.largest_efforts) if mode == "effort" else parts
+        by_effort = np.array([mode == "effort" for mode in modes], dtype=bool)
+        start = self.state.command if self._modes == modes else self.state.displacement
+        parts = self.steps.ramp(np.where(by_effort, self.state.effort, start), command)
+        aims = np.where(by_effort, np.clip(parts, -self.largest_efforts, self.largest_efforts), parts)
         done, motion = self._dynamics.advance_compiled(
-            aims, mode, largest_effort=self.largest_efforts, effector_force=load
+            aims, modes, largest_effort=self.largest_efforts, effector_force=load
         )
         for part in parts[done:]:
-            motion = self._drive(self._dynamics, part, mode, load)
+            motion = self._drive(self._dynamics, part, modes, load)
         assert motion is not None
         return self._state(motion.equilibrium, command, motion)
 
-    def _drive(self, solver: Statics, command: np.ndarray, mode: str, load: np.ndarray | None) -> Any:
+    def _drive(self, solver: Statics, command: np.ndarray, kinds: Sequence[str], load: np.ndarray | None) -> Any:
         """Solve once, with actuators saturated at their largest effort."""
         moving = self._dynamics if solver is self._dynamics else None
         solve: Any = solver.solve if moving is None else moving.advance
         limit, count = self.largest_efforts, len(command)
-        if mode == "effort":
-            return solve(np.clip(command, -limit, limit), mode, effector_force=load)
-        if not self._limited:
-            return solve(command, mode, effector_force=load)
+        held = np.array([kind == "displacement" for kind in kinds], dtype=bool)
+        command = np.where(held, command, np.clip(command, -limit, limit))
+        if not np.isfinite(limit[held]).any():
+            return solve(command, kinds, effector_force=load)
         start, present = solver.snapshot, solver.effort[:count]
-        saturated, sign = np.abs(present) >= limit * SATURATED, np.sign(present)
+        saturated, sign = held & (np.abs(present) >= limit * SATURATED), np.sign(present)
         for attempt in range(2 * count + 2):
             target = np.where(saturated, sign * limit, command)
-            modes = ["effort" if s else "displacement" for s in saturated]
+            modes = ["effort" if s else kind for s, kind in zip(saturated, kinds, strict=True)]
             found = solve(target, modes, effector_force=load)
             equilibrium = found if moving is None else found.equilibrium
             effort, reached = equilibrium.effort[:count], equilibrium.delta[:count]
-            over = ~saturated & (np.abs(effort) > limit)
+            over = held & ~saturated & (np.abs(effort) > limit)
             # A saturated actuator is released when its command asks for less than it has reached; none after a while,
             # so that the loop terminates.
             back = saturated & (sign * (command - reached) < 0.0) & (attempt <= count)
@@ -517,7 +520,8 @@ class FEMBackend(Backend):
         if learned and not equilibrium.stable:
             distrust |= SOFT
         if motion is None and learned:
-            held = ~equilibrium.slack & (np.abs(equilibrium.effort[slices["a"]]) < self.largest_efforts * SATURATED)
+            held = ~equilibrium.slack & ~self.robot.by_effort
+            held &= np.abs(equilibrium.effort[slices["a"]]) < self.largest_efforts * SATURATED
             uncertainty = float(np.linalg.norm(possible_errors(statics, held)[:3]))
             distrust |= SPREAD if uncertainty > self.robot.goal_tolerance else 0
         return State(

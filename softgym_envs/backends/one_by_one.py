@@ -163,7 +163,7 @@ class OneByOne(BatchBackend):
         gap = np.stack(stretched) - np.stack([state.command for state in self._settled])
         a, e = (models[0].slices[role] for role in "ae")
         compliance, follows = np.stack([model.compliance for model in models]), np.abs(gap) < 1e-6 * self.robot.rates
-        return condensed_gradient(compliance, a, e, follows, effector, effort)
+        return condensed_gradient(compliance, a, e, follows, effector, effort, self.robot.by_effort)
 
 
 def _stack(values: Sequence[np.ndarray]) -> np.ndarray:

@@ -39,9 +39,13 @@ def check_backend(name: str, robot: Robot, options: Mapping[str, object]) -> Non
     """Check the options of a backend, besides robot and design, before it is made.
 
     Raises:
-        ValueError: for an unknown name or option, or a value of the wrong type.
+        ValueError: for an unknown name or option, a value of the wrong type, or actuators that the backend does not
+            take.
     """
-    check_options(f"backend '{name}'", backend_class(name, robot), 2, options)
+    found = backend_class(name, robot)
+    if not found.commands_efforts:
+        robot.needs_displacements(f"backend '{name}'")
+    check_options(f"backend '{name}'", found, 2, options)
 
 
 def takes_option(name: str, robot: Robot, option: str) -> bool:

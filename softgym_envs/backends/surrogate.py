@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from softgym_envs.backends.backend import (
+    COMMANDED,
     Backend,
     PointForce,
     Snapshot,
@@ -57,10 +58,20 @@ def solve_efforts(model: SurrogateModel, context: Context, effort: np.ndarray, s
     )
 
 
-def rest_state(model: SurrogateModel, context: Context, unilateral: np.ndarray) -> BatchState:
+def effort_gradient(
+    model: SurrogateModel, context: Context, state: BatchState, effector: np.ndarray, effort: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return what `displacement_gradient` does where efforts are commanded, whose displacements follow all of them."""
+    held = model.effector_gradient(context, state.displacement, effector)
+    K = model.stiffness(context, state.displacement)
+    held = held + np.matmul(K, effort[:, :, None])[:, :, 0]
+    return held, np.linalg.solve(K, held[:, :, None])[:, :, 0]
+
+
+def rest_state(model: SurrogateModel, context: Context, unilateral: np.ndarray, by_effort: bool = False) -> BatchState:
     """Return the states at rest: without effort, or with actuators held at zero if loads would move them."""
     zero = np.zeros((len(context.slot), model.count))
-    if model.card.get("loaded", False):
+    if model.card.get("loaded", False) and not by_effort:
         return solve_displacements(model, context, zero, zero, unilateral)
     return solve_efforts(model, context, zero, zero)
 
@@ -179,6 +190,25 @@ def _motion_of(
     return SurrogateMotion(model, read_inertia(folder, model.robot), steps)
 
 
+def _all_by_effort(robot: Robot, dynamics: bool) -> bool:
+    """Return whether a robot commands efforts, in place of displacements.
+
+    Raises:
+        ValueError: for a robot that commands both, or efforts in motion.
+    """
+    if not (by_effort := robot.by_effort).any():
+        return False
+    if dynamics:
+        robot.needs_displacements("a surrogate in motion")
+    if not by_effort.all():
+        held = next(each.name for each in robot.actuators if not each.by_effort)
+        raise ValueError(
+            f"a surrogate takes actuators that are all commanded in effort or all in displacement, but robot "
+            f"'{robot.name}' commands the displacement of '{held}': use backend='fem'"
+        )
+    return True
+
+
 class SurrogateBatch(BatchBackend):
     """States of many bodies from a learned condensed model, evaluated together.
 
@@ -210,6 +240,7 @@ class SurrogateBatch(BatchBackend):
         **steps: float,
     ) -> None:
         self.robot, self._touch = robot, robot.learning.touch
+        self._by_effort = _all_by_effort(robot, dynamics)
         self.takes_touch = self._touch is not None
         self.steps = TimeSteps(**steps)
         if isinstance(weights, SurrogateModel):
@@ -262,7 +293,7 @@ class SurrogateBatch(BatchBackend):
         return np.array([[{**loads, **dict(zip(names, row, strict=True))}[k] for k in space.names] for row in designs])
 
     def _rest_states(self, context: Context, designs: np.ndarray) -> BatchState:
-        rest = rest_state(self.model, context, self._unilateral)
+        rest = rest_state(self.model, context, self._unilateral, self._by_effort)
         if not rest.converged.all():
             lost = designs[np.flatnonzero(~rest.converged)[0]].tolist()
             design = dict(zip(self.robot.design_space.names, lost, strict=True))
@@ -324,10 +355,10 @@ class SurrogateBatch(BatchBackend):
             self._put(np.array([i]), self.model.context(self._values(design[None], touch)))
             self._touched[i] = load is not None
 
-    def equilibria(self, command: np.ndarray, mode: str = "displacement") -> BatchState:
+    def equilibria(self, command: np.ndarray, mode: str = COMMANDED) -> BatchState:
         """Return the equilibria under commands (B, n_a), displacements or efforts; the search begins at the present."""
         present = self.state
-        if mode == "effort":
+        if mode == "effort" or (mode == COMMANDED and self._by_effort):
             return self._own(solve_efforts(self.model, self._context, command, present.displacement))
         return self._own(
             solve_displacements(
@@ -335,7 +366,7 @@ class SurrogateBatch(BatchBackend):
             )
         )
 
-    def step(self, command: np.ndarray, mode: str = "displacement") -> None:
+    def step(self, command: np.ndarray, mode: str = COMMANDED) -> None:
         present = self.state
         if self._motion is None:
             state = self.equilibria(command, mode)
@@ -351,8 +382,11 @@ class SurrogateBatch(BatchBackend):
             self.state = replace(state.where(found, present), converged=found)
 
     def effectors(self, index: np.ndarray, commands: np.ndarray) -> np.ndarray:
-        context = self._context.rows(index)
-        found = solve_displacements(self.model, context, commands, np.zeros_like(commands), self._unilateral)
+        context, zero = self._context.rows(index), np.zeros_like(commands)
+        if self._by_effort:
+            found = solve_efforts(self.model, context, commands, zero)
+        else:
+            found = solve_displacements(self.model, context, commands, zero, self._unilateral)
         return np.where(found.converged[:, None], found.effector[:, :3], np.nan)
 
     @property
@@ -383,7 +417,8 @@ class SurrogateBatch(BatchBackend):
     def gradient(self, effector: np.ndarray, effort: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         state = self.state if self._motion is None else self._settled
         unused = self.model.effectors - self._effectors
-        return displacement_gradient(self.model, self._context, state, np.pad(effector, ((0, 0), (0, unused))), effort)
+        gradient = effort_gradient if self._by_effort else displacement_gradient
+        return gradient(self.model, self._context, state, np.pad(effector, ((0, 0), (0, unused))), effort)
 
     # -- a batch of one -----------------------------------------------------------------------------------------------
 
@@ -428,6 +463,8 @@ class SurrogateBatch(BatchBackend):
 class SurrogateBackend(Backend):
     """One body on a learned condensed model, in static equilibria or in motion in time: a `SurrogateBatch` of one.
 
+    Models are learned over displacements; those under commanded efforts are found by Newton's method on the model.
+
     Args:
         robot: the robot.
         design: first design; missing variables take their baseline.
@@ -462,6 +499,7 @@ class SurrogateBackend(Backend):
         stiffness_damping: float = 0.01,
     ) -> None:
         self.robot, self.design = robot, robot.design_space.complete(design)
+        self._by_effort = bool(robot.by_effort.any())
         self._batch = SurrogateBatch(
             robot, self.design.array[None], weights, members, dynamics=dynamics, control_step=control_step,
             time_step=time_step, mass_damping=mass_damping, stiffness_damping=stiffness_damping,
@@ -470,6 +508,8 @@ class SurrogateBackend(Backend):
         self.takes_touch = self._batch.takes_touch
         self._touch: PointForce | None = None
         self.state = self._rest = self._batch.row(np.zeros(len(robot.actuators)), self._batch.state)
+
+    commands_efforts = True
 
     @classmethod
     def batch_class(cls, robot: Robot, options: Mapping[str, object]) -> type[BatchBackend]:
@@ -504,9 +544,9 @@ class SurrogateBackend(Backend):
         self.touch(snapshot.extra)
         self.restore(snapshot.state)
 
-    def step(self, command: np.ndarray, mode: str = "displacement", *, force: np.ndarray | None = None) -> State:
+    def step(self, command: np.ndarray, mode: str = COMMANDED, *, force: np.ndarray | None = None) -> State:
         refuse_force(force)
-        command = self._checked(command, mode)
+        command, mode = self._checked(command, mode)
         if self.moving and mode != "displacement":
             raise ValueError(f"mode = {mode!r} is not available in motion on the surrogate; allowed: 'displacement'")
         batch = self._batch
@@ -517,19 +557,22 @@ class SurrogateBackend(Backend):
         self.state = batch.present(command) if self.moving else batch.row(command, batch.state)
         return self.state
 
-    def probe(self, command: np.ndarray, mode: str = "displacement") -> State:
+    def probe(self, command: np.ndarray, mode: str = COMMANDED) -> State:
         """Return the static equilibrium under a command without going there."""
-        command = self._checked(command, mode)
+        command, mode = self._checked(command, mode)
         found = self._batch.equilibria(command[None], mode)
         if not found.converged[0]:
             raise ConvergenceError(f"the surrogate finds no equilibrium under {mode}s {command.tolist()}")
         return self._batch.row(command, found)
 
-    def _checked(self, command: np.ndarray, mode: str) -> np.ndarray:
+    def _checked(self, command: np.ndarray, mode: str) -> tuple[np.ndarray, str]:
+        """Return a command (n_a,) and what it commands, ``"displacement"`` or ``"effort"``."""
         command = check_command(self.robot, command, mode)
+        if mode == COMMANDED:
+            mode = "effort" if self._by_effort else "displacement"
         if mode == "effort" and (command[self.robot.unilateral] < 0.0).any():
             raise ValueError(f"efforts {command.tolist()} must not be negative: the actuators cannot push")
-        return command.copy()
+        return command.copy(), mode
 
     def restore(self, state: State) -> None:
         self.state = state

@@ -177,17 +177,21 @@ class InverseQP:
     def for_robot(cls, robot: Robot, **options: Any) -> Self:
         """Return the controller of a robot, with the ranges, rates and largest efforts of its actuators.
 
-        It refuses goals that are far from the robot, such as those in millimetres.
+        Actuators that the robot commands in effort are commanded so here, and their displacements are not bounded. It
+        refuses goals that are far from the robot, such as those in millimetres.
 
         Args:
             robot: the robot. The goal weights of a robot with one effector are its goal axes.
             **options: arguments of the class, which replace those of the robot.
         """
         largest = np.array([actuator.max_effort for actuator in robot.actuators])
+        by_effort = robot.by_effort
         arguments = {
-            "lower": robot.lower,
-            "upper": robot.upper,
-            "rates": robot.rates,
+            "lower": np.where(by_effort, -np.inf, robot.lower),
+            "upper": np.where(by_effort, np.inf, robot.upper),
+            "rates": np.where(by_effort, np.inf, robot.rates),
+            "effort_rates": np.where(by_effort, robot.command_rates, np.inf),
+            "mode": robot.command_modes,
             "unilateral": robot.unilateral,
             "min_effort": -largest,
             "max_effort": largest,

@@ -56,12 +56,15 @@ class AgentSpaces:
         self.axes: Array = np.ones(3) if axes is None else axes
         self.moving = moving
         self.sensors = sensors
-        self.lower: Array = robot.lower
-        self.upper: Array = robot.upper
-        self.rates: Array = robot.rates
+        self.lower: Array
+        self.upper: Array
+        self.lower, self.upper = robot.command_limits
+        self.rates: Array = robot.command_rates
         self.effort_scale: Array = np.asarray(robot.effort_scale, dtype=float)
-        self.middle: Array = 0.5 * (robot.lower + robot.upper)
-        self.half_range: Array = 0.5 * (robot.upper - robot.lower)
+        self.middle: Array = 0.5 * (self.lower + self.upper)
+        self.half_range: Array = 0.5 * (self.upper - self.lower)
+        self.displacement_middle: Array = 0.5 * (robot.lower + robot.upper)
+        self.displacement_half: Array = 0.5 * (robot.upper - robot.lower)
         self.position_scale = 1.25 * robot.size if goal_scale is None else goal_scale
         self.error_scale = robot.workspace_scale / 2.5 if error_scale is None else error_scale
         n = len(robot.actuators)
@@ -104,7 +107,7 @@ class AgentSpaces:
         return np.minimum(np.maximum(action, -1.0), 1.0)
 
     def command(self, action: Array, previous: Array) -> Array:
-        """Return the commanded displacements that an action in [-1, 1] leads to, shape (..., n_a)."""
+        """Return the commands that an action in [-1, 1] leads to, shape (..., n_a)."""
         xp = namespace(action)
         if self.action_mode == "increment":
             target = previous + action * self.rates
@@ -130,7 +133,7 @@ class AgentSpaces:
         return np.broadcast_to(slope, wish.shape), limited
 
     def action(self, command: np.ndarray, previous: np.ndarray) -> np.ndarray:
-        """Return the action that leads to a command, shape (..., n_a), for controllers that compute displacements."""
+        """Return the action that leads to a command, shape (..., n_a), for controllers that compute commands."""
         if self.action_mode == "increment":
             action = (command - previous) / self.rates
         else:
@@ -155,7 +158,7 @@ class AgentSpaces:
         loss.
 
         Args:
-            command: commanded displacements, shape (..., n_a).
+            command: commanded displacements or efforts, shape (..., n_a).
             displacement: displacements, shape (..., n_a).
             effort: efforts, shape (..., n_a).
             effector: first effector [m], shape (..., 3).
@@ -171,7 +174,7 @@ class AgentSpaces:
             parts += [sensors, goal / self.position_scale]
         else:
             parts += [
-                (displacement - self.middle) / self.half_range,
+                (displacement - self.displacement_middle) / self.displacement_half,
                 squash(effort / self.effort_scale),
                 effector / self.position_scale,
                 *self._goal_parts(effector, goal),

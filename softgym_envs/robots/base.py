@@ -356,13 +356,47 @@ class Robot(ABC):
         }
 
     @property
+    def by_effort(self) -> np.ndarray:
+        """Which actuators are commanded in effort, the others in displacement, shape (n_a,)."""
+        return np.array([actuator.by_effort for actuator in self.actuators], dtype=bool)
+
+    @property
+    def command_modes(self) -> tuple[str, ...]:
+        """What each actuator is commanded in, as solvers name it: ``"displacement"`` or ``"effort"``."""
+        return tuple("effort" if actuator.by_effort else "displacement" for actuator in self.actuators)
+
+    @property
+    def command_limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """Smallest and largest commands, displacements or efforts, each of shape (n_a,)."""
+        ends = np.array([actuator.command_range for actuator in self.actuators]).reshape(-1, 2)
+        return ends[:, 0], ends[:, 1]
+
+    @property
+    def command_rates(self) -> np.ndarray:
+        """Largest change of the commands per control step, shape (n_a,)."""
+        return np.array([actuator.command_rate for actuator in self.actuators])
+
+    @property
+    def effort_limited(self) -> list[str]:
+        """Names of actuators that do not reach a commanded displacement beyond their largest effort."""
+        return [each.name for each in self.actuators if np.isfinite(each.max_effort) and not each.by_effort]
+
+    def needs_displacements(self, what: str) -> None:
+        """Raise ValueError, in the name of what takes displacements only, if an actuator is commanded in effort."""
+        if names := [actuator.name for actuator in self.actuators if actuator.by_effort]:
+            raise ValueError(
+                f"{what} takes actuators that are commanded in displacement, but robot '{self.name}' commands the "
+                f"effort of {', '.join(names)}: leave effort_rate out"
+            )
+
+    @property
     def lower(self) -> np.ndarray:
-        """Smallest commanded displacements, shape (n_a,)."""
+        """Smallest displacements that are commanded or occur, shape (n_a,)."""
         return np.array([actuator.low for actuator in self.actuators])
 
     @property
     def upper(self) -> np.ndarray:
-        """Largest commanded displacements, shape (n_a,)."""
+        """Largest displacements that are commanded or occur, shape (n_a,)."""
         return np.array([actuator.high for actuator in self.actuators])
 
     def effort_sizes(self, efforts: np.ndarray) -> np.ndarray:
@@ -373,7 +407,7 @@ class Robot(ABC):
 
     @property
     def rates(self) -> np.ndarray:
-        """Largest change of the command per control step, shape (n_a,)."""
+        """Largest change of displacements per control step, shape (n_a,)."""
         return np.array([actuator.rate for actuator in self.actuators])
 
     @property

@@ -161,6 +161,8 @@ def _check_antagonists(robot: Robot) -> None:
                 raise ValueError(f"{owner}: {unknown_name('actuator', name, actuators)}")
             if name in seen:
                 raise ValueError(f"{owner}: '{name}' is in two groups")
+            if actuators[name].by_effort:
+                raise ValueError(f"{owner}: '{name}' is commanded in effort, which no other actuator pulls against")
             seen.add(name)
             high, low = actuators[name].high, actuators[name].low
             if low != -high or high != actuators[group[0]].high:

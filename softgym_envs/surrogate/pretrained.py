@@ -6,7 +6,6 @@ Those of the suite were made by ``softgym fit --config <weights name>``.
 from __future__ import annotations
 
 import json
-import math
 import sys
 from collections.abc import Iterable, Mapping
 from importlib.util import find_spec
@@ -105,7 +104,7 @@ def standalone_model(robot: Robot, weights: str | Path | None = None, members: i
     Raises:
         WeightsError: also for actuators with a largest effort, which learned models do not know.
     """
-    if limited := [actuator.name for actuator in robot.actuators if math.isfinite(actuator.max_effort)]:
+    if limited := robot.effort_limited:
         kept = weights is not None or ships_weights(robot)
         hybrid = "'hybrid'" if kept else "'hybrid' with weights of 'softgym fit'"
         raise WeightsError(

@@ -153,7 +153,7 @@ def commanded_displacement(state: State) -> np.ndarray:
 
     It equals the displacement of the state except for a slack cable, whose path shortens further than it is pulled.
     """
-    return np.where(state.slack, state.command, state.displacement)
+    return np.where(state.slack, state.command, state.displacement)  # efforts leave no actuator slack
 
 
 def slacken(path: np.ndarray, excess: float, side: Sequence[float], count: int = 12) -> np.ndarray:
@@ -265,12 +265,12 @@ class ShapeFinder:
         self._target = np.array(displacement, dtype=float)
         last = backend.state
         try:
-            backend.step(self._target)
+            backend.step(self._target, "displacement")
             return
         except ConvergenceError:
             pass
         try:  # the step from the last shape may be too long, while the one from rest converges
             backend.reset()
-            backend.step(self._target)
+            backend.step(self._target, "displacement")
         except ConvergenceError:
             backend.restore(last)

@@ -14,6 +14,7 @@ import pytest
 from PIL import Image
 
 from softgym_envs.agents.config import TrainConfig
+from softgym_envs.agents.policy import Policy
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.codesign.folder import SHARED_POLICY, StudyFolder
 from softgym_envs.codesign.phases.finalists import _trained_policy
@@ -157,6 +158,31 @@ def test_finalists_are_trained_anew_with_several_seeds(run):
     winner = f"winner-trial{results.winner.trial:04d}"
     assert (folder.path / f"{winner}.stl").stat().st_size > 10_000
     assert (folder.path / f"{winner}.rrd").read_bytes()[:3] == b"RRF"
+
+
+def test_finalists_of_a_warm_start_begin_with_the_networks_of_its_policy(study, monkeypatch):
+    training = {
+        "steps": 160,
+        "report_every": 80,
+        "evaluation_episodes": 2,
+        "sac": {"net_arch": [16], "learning_starts": 100},
+    }
+    finalists = {"count": 1, "seeds": 1}
+    policy = "finger_reach_designs"
+    folder = study(strategy="warm_start", policy=policy, environment=SHOWN, training=training, finalists=finalists)
+    begun = []
+
+    def train(config, where, **options):
+        begun.append((config, options["initial"]))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("softgym_envs.codesign.phases.finalists.train", train)
+    finalist = Finalist(0, "baseline", folder.config.baseline, {}, 0.0, "trials/0000/policy.safetensors")
+    with pytest.raises(KeyboardInterrupt):
+        _trained_policy(folder, finalist, 1)
+    (config, initial), widths = begun[0], Policy(policy).widths
+    assert initial == policy and config.settings.net_arch == widths != [16]
+    assert config.settings.learning_starts == 100
 
 
 def test_a_training_of_a_finalist_with_other_steps_begins_again(study, monkeypatch):

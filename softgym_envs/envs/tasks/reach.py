@@ -43,7 +43,7 @@ class Reach(Task):
     def sample(self, rng: Random, count: int, kinematics: Kinematics) -> Array:
         if self.fixed_goals is not None:
             return self.fixed_goals[rng.integers(len(self.fixed_goals), size=count)][:, None]
-        high = self.robot.upper
-        low = self.robot.lower + self.command_low * (high - self.robot.lower)
+        lower, high = self.robot.command_limits
+        low = lower + self.command_low * (high - lower)
         goals = kinematics(self.robot.balanced(rng.uniform(low, high, (count, len(low)))))
         return (goals + rng.uniform(-self.spread, self.spread, goals.shape))[:, None]

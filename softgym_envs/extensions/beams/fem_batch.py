@@ -48,7 +48,8 @@ class FEMBatch(BatchBackend):
         count, size = len(designs), len(_rest(first)[1])
         self._slices = first.state.condensed.slices
         self._slack_tolerance = RowLayout.of(first.model).slack_tolerance
-        self._is_driven = np.arange(size) < len(robot.actuators)
+        self._by_effort = robot.by_effort
+        self._is_driven = np.append(~self._by_effort, np.zeros(size - len(robot.actuators), dtype=bool))
         body = _beams(first).body
         self._present = BeamStates.of(body, size, count, factors=self.moving)
         self._balanced = BeamStates.of(body, size, count, factors=False) if self.moving else self._present
@@ -204,7 +205,12 @@ class FEMBatch(BatchBackend):
         a, e = self._slices["a"], self._slices["e"]
         displacement, effort = states.delta[:, a], states.effort[:, a]
         # The sign of the effort alone does not suffice: at rest it is round-off.
-        slack = self.robot.unilateral & (effort <= 0.0) & (displacement > self.command + self._slack_tolerance)
+        slack = (
+            self.robot.unilateral
+            & ~self._by_effort
+            & (effort <= 0.0)
+            & (displacement > self.command + self._slack_tolerance)
+        )
         count = len(effort)
         return BatchState(
             displacement.copy(),
@@ -260,7 +266,7 @@ class FEMBatch(BatchBackend):
             raise ValueError(f"robot '{self.robot.name}' touches obstacles: its equilibria have no gradient")
         states, a, e = self._balanced, self._slices["a"], self._slices["e"]
         follows = np.abs(states.delta[:, a] - self.command) < 1e-6 * self.robot.rates
-        return condensed_gradient(states.compliance, a, e, follows, effector, effort)
+        return condensed_gradient(states.compliance, a, e, follows, effector, effort, self._by_effort)
 
 
 def _beams(owner: FEMBackend) -> BeamMotion:

@@ -378,7 +378,7 @@ def _distance(one: np.ndarray, other: np.ndarray) -> float:
 
 
 def _learning(robot: Robot, model: MechanicalModel) -> Finding:
-    if limited := [actuator.name for actuator in robot.actuators if np.isfinite(actuator.max_effort)]:
+    if limited := robot.effort_limited:
         text = f"no surrogate: a learned model drives {', '.join(limited)} beyond max_effort"
         return Finding("surrogate", "note", text, "backend='fem', or leave max_effort out and check efforts afterwards")
     if robot.obstacles:

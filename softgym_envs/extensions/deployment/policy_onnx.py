@@ -68,6 +68,7 @@ def exported_spaces(policy: Policy) -> AgentSpaces:
     env = policy.environment.make()
     env.close()
     spaces: AgentSpaces = env.unwrapped.spaces  # type: ignore[attr-defined]
+    spaces.robot.needs_displacements(f"export of policy '{policy.path}'")
     if spaces.sensors:
         raise ValueError(
             f"policy '{policy.path}' observes sensors in place of the effector and cannot be exported; allowed: "

@@ -119,7 +119,9 @@ class Body:
     def states(self) -> list[State]:
         """States from rest to the full command; raises `InfeasibleDesign` and `ConvergenceError`."""
         backend = self._backend
-        return [backend.state] + [backend.step(k / self.steps * self.command) for k in range(1, self.steps + 1)]
+        return [backend.state] + [
+            backend.step(k / self.steps * self.command, "displacement") for k in range(1, self.steps + 1)
+        ]
 
     @cached_property
     def course(self) -> ActuationPath:

@@ -344,8 +344,7 @@ def check_learnable(robot: Robot, config: FitConfig) -> None:
             f"robot '{robot.name}' touches obstacles, which a surrogate does not learn: use backend='fem', or fit it "
             "without them"
         )
-    limited = [actuator.name for actuator in robot.actuators if np.isfinite(actuator.max_effort)]
-    if config.alone and limited:
+    if config.alone and (limited := robot.effort_limited):
         raise ConfigError(
             f"robot '{robot.name}': a surrogate would drive {', '.join(limited)} beyond max_effort: leave it out and "
             "check efforts afterwards, or set alone = false for backend='hybrid'"

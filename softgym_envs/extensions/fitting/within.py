@@ -58,7 +58,7 @@ def predict_within(
         for row in rows:
             backend.reset(design)
             try:
-                found = backend.step(states.command[row])
+                found = backend.step(states.command[row], "displacement")
             except ConvergenceError:
                 continue
             error[row] = np.linalg.norm(found.effector.ravel()[:3] - states.effector[row, :3])

@@ -457,6 +457,7 @@ def _check_setup(id: str, setup: Setup) -> None:
         raise ValueError(f"id = {id!r} is not an environment on the surrogate; allowed: {', '.join(supported)}")
     if setup.backend_options.get("dynamics", False) and not setup.robot.learning.parts:
         raise ValueError("dynamics is not available on tensors; allowed: False, or gymnasium.make_vec")
+    setup.robot.needs_displacements("an environment on tensors")
     if setup.plants is not None:
         raise ValueError("plant is not available on tensors; allowed: None, or gymnasium.make_vec")
     if chosen := [name for name in setup.shown if setup.robot.design_space[name].choices]:

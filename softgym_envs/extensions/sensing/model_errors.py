@@ -49,7 +49,9 @@ def measured_errors(
                 plant.touch(load)
                 with warnings.catch_warnings():
                     warnings.simplefilter("ignore", CrossingWarning)  # walls do not touch in what was learned either
-                    delta = plant.step(robot.lower + share * (robot.upper - robot.lower)).condensed.delta
+                    delta = plant.step(
+                        robot.lower + share * (robot.upper - robot.lower), "displacement"
+                    ).condensed.delta
                 rows.append(np.concatenate([delta.e, delta.s]))
         except ConvergenceError:
             continue

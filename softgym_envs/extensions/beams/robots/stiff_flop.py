@@ -61,6 +61,8 @@ class StiffFlop(Robot):
         largest_volume: largest growth of a pair of chambers [m3]. The default is that of the authors' public code, and
             the range of the shipped surrogate. Target A of the thesis (fig. 4.11) needs 35 mm3: pass 40e-9.
             The larger the volumes, the more bodies buckle.
+        largest_pressure: largest commanded pressure of a pair of chambers [Pa], which changes by a twentieth of it in a
+            step: chambers on valves. By default they are commanded in volume.
         **options: options of `Robot`.
     """
 
@@ -68,7 +70,7 @@ class StiffFlop(Robot):
     effectors = ("tip",)
     size = 0.11
     made_of_beams = True
-    non_mechanical_options = (*Robot.non_mechanical_options, "largest_volume")
+    non_mechanical_options = (*Robot.non_mechanical_options, "largest_volume", "largest_pressure")
     design_boxes = {
         # 30 % about the baseline, except where chambers would leave the body.
         "wide": {
@@ -87,6 +89,7 @@ class StiffFlop(Robot):
         gravity: tuple[float, float, float] = (0.0, 0.0, 0.0),
         unilateral: bool = True,
         largest_volume: float = 30e-9,
+        largest_pressure: float | None = None,
         **options: Any,
     ) -> None:
         super().__init__(gravity=gravity, **options)
@@ -111,8 +114,11 @@ class StiffFlop(Robot):
         )
         self.effector_rest = np.array([0.11, 0.0, 0.0])
         self.effort_scale = np.full(6, 1e5)
+        drive = {"unit": "m3", "unilateral": unilateral}
+        if largest_pressure is not None:
+            drive |= {"max_effort": float(largest_pressure), "effort_rate": 0.05 * largest_pressure}
         self.actuators = tuple(
-            Actuator(f"{module}_{pair + 1}", 0.0, float(largest_volume), 1.5e-9, unit="m3", unilateral=unilateral)
+            Actuator(f"{module}_{pair + 1}", 0.0, float(largest_volume), 1.5e-9, **drive)
             for module in ("base", "tip")
             for pair in range(3)
         )
