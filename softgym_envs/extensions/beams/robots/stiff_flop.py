@@ -114,7 +114,7 @@ class StiffFlop(Robot):
         )
         self.effector_rest = np.array([0.11, 0.0, 0.0])
         self.effort_scale = np.full(6, 1e5)
-        drive = {"unit": "m3", "unilateral": unilateral}
+        drive: dict[str, Any] = {"unit": "m3", "unilateral": unilateral}
         if largest_pressure is not None:
             drive |= {"max_effort": float(largest_pressure), "effort_rate": 0.05 * largest_pressure}
         self.actuators = tuple(
