@@ -502,6 +502,12 @@ class FEMBackend(Backend):
             solver.snapshot = start
         return found
 
+    def _uncertainty(self, equilibrium: Equilibrium, command: np.ndarray) -> float:
+        """Return how far learned energies may put the first effector off at an equilibrium under a command [m]."""
+        effort = equilibrium.effort[equilibrium.condensed.slices["a"]]
+        held = ~equilibrium.slack & ~self.robot.by_effort & (np.abs(effort) < self.largest_efforts * SATURATED)
+        return float(np.linalg.norm(possible_errors(self._statics, held)[:3]))
+
     def _state(
         self, equilibrium: Equilibrium, command: np.ndarray, motion: Motion | None = None, *, still: bool = False
     ) -> State:
@@ -520,9 +526,7 @@ class FEMBackend(Backend):
         if learned and not equilibrium.stable:
             distrust |= SOFT
         if motion is None and learned:
-            held = ~equilibrium.slack & ~self.robot.by_effort
-            held &= np.abs(equilibrium.effort[slices["a"]]) < self.largest_efforts * SATURATED
-            uncertainty = float(np.linalg.norm(possible_errors(statics, held)[:3]))
+            uncertainty = self._uncertainty(equilibrium, command)
             distrust |= SPREAD if uncertainty > self.robot.goal_tolerance else 0
         return State(
             command=np.array(command, dtype=float),

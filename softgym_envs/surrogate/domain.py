@@ -140,6 +140,12 @@ def assess_trust(
         distrust[row] = code
 
 
+def share_at_bounds(values: np.ndarray, middle: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """Return the part of values (..., k) that lie at their bounds ``middle -+ half`` (k,), shape (...)."""
+    away = np.abs(values - middle) / half
+    return np.clip((away - 1.0) / EDGE + 1.0, 0.0, 1.0).mean(axis=-1)
+
+
 @dataclass(frozen=True)
 class Domain:
     """The box of states a model was trained on, and the limits below which its predictions are trusted.
@@ -187,8 +193,7 @@ class Domain:
         """Return the part of the design variables of bodies (B, d) that lie at their bounds, shape (B,)."""
         if not self.columns:
             return np.zeros(len(designs))
-        away = np.abs(designs[:, self.columns] - self.middle) / self.half
-        return np.clip((away - 1.0) / EDGE + 1.0, 0.0, 1.0).mean(axis=1)
+        return share_at_bounds(designs[:, self.columns], self.middle, self.half)
 
     @classmethod
     def of_card(cls, card: Mapping[str, Any], robot: Robot) -> Domain:

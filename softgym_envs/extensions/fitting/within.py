@@ -81,7 +81,9 @@ def calibrate_within(
     """Calibrate the weights of a part by the effector of whole bodies, and write the result to their card.
 
     What the members say about the part's efforts moves the effector by the compliance of the body. One factor scales
-    this such that it covers 95 % of the errors of all strata together, which have equally many states.
+    this such that it covers 95 % of the errors, and another one those of slack corners, by the share of a body's
+    commands that are at their bounds. States of one body err alike: many bodies of one command say more than few of
+    many.
 
     Args:
         folder: the weights of the part.
@@ -100,8 +102,11 @@ def calibrate_within(
     card["calibration"] = {"within": whole.name, "bodies": bodies, "states": states, "seed": seed, "inflation": 1.0}
     write_json(path, card)
     plain = predict_within(folder, whole, known)
-    ratio = (plain.error / plain.uncertainty)[plain.found]
-    card["calibration"]["inflation"] = conformal_quantile(ratio)
+    ratio, slack = plain.error / plain.uncertainty, known.stratum == "slack corners"
+    inflation = conformal_quantile(ratio[plain.found & ~slack])
+    card["calibration"]["inflation"] = inflation
+    if (plain.found & slack).any():
+        card["calibration"]["slack_corners"] = max(1.0, conformal_quantile(ratio[plain.found & slack]) / inflation)
     write_json(path, card)
     found = by_stratum(predict_within(folder, whole, known), known)
     card["calibration"]["strata"] = {name: asdict(row) for name, row in found.items()}

@@ -165,6 +165,9 @@ class HeldFingers(Massless):
         rows: first row of the object's frame, and a row for each finger, whose x and y are its cables [m].
         energy: of the fingers.
         placements: rotation (3, 3) and shift [m] (3,) of each finger.
+
+    Attributes:
+        count: number of fingers.
     """
 
     def __init__(
@@ -177,6 +180,7 @@ class HeldFingers(Massless):
     ) -> None:
         self.energy, self.learned = energy, energy.learned
         frame, own = int(rows[0]), rows[1:]
+        self.count = len(own)
         self.nodes_used = np.concatenate([frame + np.arange(4), own])
         # Over these rows the coordinates are linear: the cables, then the frame. Shapes (F, 14) and (F, 8, 14).
         held = 3 * frame + np.arange(12)

@@ -355,6 +355,25 @@ def test_the_factor_of_errors_stands_in_the_card(model):
     np.testing.assert_allclose(twice.errors(y), 2.0 * plain.errors(y), rtol=1e-12)
 
 
+def test_slack_corners_have_a_factor_of_their_own(tmp_path):
+    """It grows with the share of the commands at their bounds, of the fingers that a body has."""
+    robot = make_robot("composed_gripper")
+    design, corner = {"fingers": "1+1"}, np.full(10, 0.009)
+    corner[:4] = [-0.002, 0.020, 0.020, 0.020]
+    found = []
+    for factor in (1.0, 3.0):
+        folder = tmp_path / str(factor)
+        shutil.copytree(pretrained_folder(robot.one_part()), folder)
+        card = json.loads((folder / "model.json").read_text())
+        card["calibration"]["slack_corners"] = factor
+        (folder / "model.json").write_text(json.dumps(card))
+        backend = FingersBackend(robot, design, folder)
+        states = [backend.step(command) for command in (np.full(10, 0.009), corner)]
+        assert not states[0].slack.any() and states[1].slack.any()
+        found.append([state.uncertainty for state in states])
+    np.testing.assert_allclose(np.divide(*found[::-1]), [1.0, 3.0], rtol=1e-6)
+
+
 def test_calibration_by_whole_grippers_covers_their_errors(tmp_path, monkeypatch):
     """Also by the command line; the states of finite elements are kept and not solved again."""
     robot, strata = make_robot("composed_gripper"), ("inside", "corners")
