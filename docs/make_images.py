@@ -68,12 +68,13 @@ FILM_SIZE, FILM_FRAMES = (360, 300), 30
 FILM_AGENTS = {
     "crawler_walk": "crawler_walk_gait", "finger_grasp": "force", "gripper_lift": "close", "quadruped_climb": "gait",
     "quadruped_follow": "steer", "quadruped_walk": "gait", "swimmer_swim": "gait", "tetrapod_carry": "tetrapod_carry",
+    "whip_throw": "whip_throw_gait",
 }  # fmt: skip
 """Agents of the films of environments, where it is not the inverse QP."""
 FILM_STEPS = {
     "crawler_walk": 100, "gripper_lift": 50, "quadruped_climb": 100, "quadruped_follow": 200, "quadruped_walk": 100,
     "swimmer_swim": 100,
-    "tetrapod_carry": 60,
+    "tetrapod_carry": 60, "whip_throw": 30,
 }  # fmt: skip
 WALKERS = {"baseline": "quadruped_walk_gait", "winner": "quadruped_walk_winner"}
 """Policies of the film of walkers, each for its own body."""

@@ -118,6 +118,12 @@ def cost_of_transport(outcome: Outcome) -> np.ndarray:
     return _tally(outcome, "power") / (weight * np.maximum(_tally(outcome, "speed"), SLOWEST))
 
 
+@metric("m", "maximize")
+def throw_range(outcome: Outcome) -> np.ndarray:
+    """Return how far ahead of the base a throw lands."""
+    return _tally(outcome, "range")
+
+
 @metric("m3", source="body")
 def material_volume(model: MechanicalModel) -> float:
     """Return the volume of the solid."""

@@ -212,7 +212,7 @@ _NAMES = (
     *("success_rate", "mean_distance", "mean_return", "mean_tracking_distance", "mean_effort"),
     "mean_settled_distance",
     *("largest_effort", "largest_strain", "self_force", "untrusted_share", "material_volume"),
-    *("forward_speed", "relative_drift", "relative_slip", "cost_of_transport"),
+    *("forward_speed", "relative_drift", "relative_slip", "cost_of_transport", "throw_range"),
 )
 METRICS: Mapping[str, Metric] = _Metrics(
     "metric",

@@ -129,7 +129,7 @@ class PointForce:
 
 @dataclass(frozen=True)
 class Ground:
-    """Where a body stands, if not as its robot says: what an episode can draw without another body.
+    """Where a body stands and what it carries, if not as its robot says: what an episode can draw without another body.
 
     On a slope that rises by an angle ``a`` along x, gravity is ``9.81 (-sin a, 0, -cos a)``: the axes are those of the
     slope, and obstacles keep their places.
@@ -137,13 +137,15 @@ class Ground:
     Attributes:
         friction: coefficient of friction of all obstacles; None: their own.
         gravity: acceleration [m/s2], shape (3,); None: that of the robot.
+        payload: mass that the rigid part of the first effector carries [kg]; None: that of the robot.
 
     Raises:
-        ValueError: for a negative coefficient, or values that are not finite or in another unit.
+        ValueError: for a negative coefficient or mass, or values that are not finite or in another unit.
     """
 
     friction: float | None = None
     gravity: Sequence[float] | None = None
+    payload: float | None = None
 
     def __post_init__(self) -> None:
         if self.friction is not None:
@@ -156,6 +158,12 @@ class Ground:
             gravity = check_numbers("gravity", self.gravity, 3)
             check_quantity("gravity", np.linalg.norm(gravity), "length of gravity")
             object.__setattr__(self, "gravity", tuple(gravity.tolist()))
+        if self.payload is not None:
+            payload = float(check_numbers("payload", [self.payload], 1)[0])
+            if payload < 0.0:
+                raise ValueError(f"payload = {payload} kg must not be negative")
+            check_quantity("mass", payload, "payload")
+            object.__setattr__(self, "payload", payload)
 
 
 @dataclass(frozen=True)
@@ -369,7 +377,7 @@ class Backend(ABC):
 
         Raises:
             ConvergenceError: if the body does not stand there; ground and state are kept.
-            ValueError: if the backend computes no contacts.
+            ValueError: if the backend computes no contacts, or for what the robot cannot stand on or carry.
         """
         raise ValueError(f"{type(self).__name__} has no ground")
 

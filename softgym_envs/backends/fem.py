@@ -144,7 +144,7 @@ class FEMBackend(Backend):
         self.largest_efforts = np.array([actuator.max_effort for actuator in robot.actuators])
         self._friction = self._checked_friction(cable_friction)
         self._compliance = self._checked_compliance(cable_compliance)
-        self._ground = Ground()
+        self._ground, self._carries = Ground(), False
         self.design = None  # type: ignore[assignment]  # until the first reset
         self.reset(robot.design_space.complete(design))
 
@@ -191,7 +191,7 @@ class FEMBackend(Backend):
         self._rest = self._state(rest, zero, still=True)
 
     def stand_on(self, ground: Ground) -> State:
-        if not self.robot.may_touch:
+        if not self.robot.may_touch and (ground.friction, ground.gravity) != (None, None):
             raise ValueError(f"robot '{self.robot.name}' touches nothing, so it has no ground")
         if ground != self._ground:
             self.touch(None)
@@ -204,10 +204,14 @@ class FEMBackend(Backend):
             self._ground = ground
         return self.reset()
 
-    @staticmethod
-    def _stand(ground: Ground, model: MechanicalModel, own: tuple[Contact | None, Sequence[float]]) -> None:
-        """Change gravity and the friction of the obstacles of a model, whose own contact and gravity are given."""
+    def _stand(self, ground: Ground, model: MechanicalModel, own: tuple[Contact | None, Sequence[float]]) -> None:
+        """Change payload, gravity and friction of a model, whose own contact and gravity are given."""
         contact, gravity = own
+        if ground.payload is not None or self._carries:
+            from softgym_envs.mechanics.elements.rigid import carry
+
+            carry(model, ground.payload)
+            self._carries = True
         model.set_gravity(gravity if ground.gravity is None else ground.gravity)
         model.contact = contact
         if contact is not None and ground.friction is not None:

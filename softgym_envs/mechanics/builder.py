@@ -206,11 +206,11 @@ class ModelBuilder:
         start = self._append(np.zeros((len(own), 3)), np.array(own, dtype=bool).reshape(-1, 3))
         self._parts.append((kind, np.array([*frames, *range(start, self.size)]), options))
 
-    def add_mass(self, frame: int, mass: float, inertia: np.ndarray) -> None:
-        """Assign a mass [kg] and an inertia along the directors [kg m2] (3, 3) to the rigid part at a frame."""
+    def add_mass(self, frame: int, mass: float, inertia: np.ndarray, payload: float = 0.0) -> None:
+        """Give the rigid part at a frame mass [kg], inertia along the directors [kg m2] (3, 3) and a payload [kg]."""
         from softgym_envs.mechanics.elements.rigid import RigidBody
 
-        self._parts.append((RigidBody, np.array(frame), {"mass": mass, "inertia": inertia}))
+        self._parts.append((RigidBody, np.array(frame), {"mass": mass, "inertia": inertia, "payload": payload}))
 
     def build(self) -> MechanicalModel:
         """Return the model, with its blocks in the order in which they were added.

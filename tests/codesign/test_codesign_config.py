@@ -254,7 +254,7 @@ def test_shipped_studies_train_a_policy_for_each_body(path):
         assert config.plan.trains
         # The gradient of a single step does not find the swing of the carrying Tetrapod, nor a way to an object.
         evolved = {"tetrapod_carry", "tetrapod_carry_wide", "finger_grasp_policy"}
-        moving = {"crawler_walk", "quadruped_walk", "swimmer_swim"}
+        moving = {"crawler_walk", "quadruped_walk", "swimmer_swim", "whip_throw"}
         own = "evolution" if config.name in evolved else "gait" if config.name in moving else "analytic"
         learner = "sac" if config.name.endswith("_sac") else own
         assert config.training.learner == learner

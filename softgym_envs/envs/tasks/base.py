@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial, reduce
 from operator import mul
@@ -158,6 +158,25 @@ def check_length(value: float, name: str, robot: Robot) -> float:
             "did you mean metres?"
         )
     return value
+
+
+def check_range(name: str, given: float | Sequence[float], unit: str, low: float, high: float) -> tuple[float, float]:
+    """Return the ends of a range from which each episode draws, given by two numbers or by one.
+
+    Raises:
+        ValueError: for anything else, or ends out of bounds.
+    """
+    unit = f" {unit}" if unit else ""
+    try:
+        ends = np.asarray(given, dtype=float)
+    except (TypeError, ValueError):
+        ends = np.full(3, np.nan)
+    pair = np.broadcast_to(ends, 2) if ends.shape in ((), (2,)) else np.full(2, np.nan)
+    if not low <= pair[0] <= pair[1] <= high:
+        raise ValueError(
+            f"{name} = {given}{unit} must be a number or a range (low, high); allowed: {low:g} to {high:g}{unit}"
+        )
+    return float(pair[0]), float(pair[1])
 
 
 def check_force(value: float, name: str, robot: Robot) -> float:

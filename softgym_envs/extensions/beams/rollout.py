@@ -21,6 +21,22 @@ ROOM = 4
 """Time steps that can be recorded for each command: more are needed where steps are divided."""
 
 
+class Gain(NamedTuple):
+    """What a motion is worth to a task whose method ``gain`` rates motions.
+
+    Attributes:
+        way: what is to be large [m].
+        value: the same less what is charged [m].
+        by_x: derivative of the value by the rows after each time step, shape (k, n, 3).
+        by_velocity: by their velocities [s], shape (k, n, 3).
+    """
+
+    way: float
+    value: float
+    by_x: np.ndarray
+    by_velocity: np.ndarray
+
+
 class Gradient(NamedTuple):
     """Derivatives of a scalar that depends on the states of a rollout.
 

@@ -137,7 +137,7 @@ class Tetrapod(Robot):
         middle = HANGING * UP
         centre = assembly.add_frame(middle)
         mass = CENTRE_MASS + self.payload
-        assembly.add_mass(centre, mass, sphere_inertia(mass, self.centre_radius))
+        assembly.add_mass(centre, CENTRE_MASS, sphere_inertia(mass, self.centre_radius), self.payload)
         section = Section.rectangle(design["leg_width"], design["leg_thickness"])
         servos, ports = [], []
         for k in range(4):

@@ -1,9 +1,9 @@
 """Search for a gait along gradients through time (model-based): commands that repeat, without feedback.
 
 The commands of a period follow the gradient of the way that the robot goes, through contact and friction
-(`softgym_envs.extensions.beams.rollout`). A gradient costs little more than the motion itself, and the motion is
-short: over a second or two a gradient tells how a gait should change, while those of many periods of a fast gait that
-slips are noise.
+(`softgym_envs.extensions.beams.rollout`), or of what else the task's method ``gain`` makes of a motion, such as the
+range of a throw. A gradient costs little more than the motion itself, and the motion is short: over a second or two a
+gradient tells how a gait should change, while those of many periods of a fast gait that slips are noise.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.config import Config
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.extensions.beams.rollout import Rollout, roll_out_backend
+from softgym_envs.extensions.walkers.robots.mobile import RhythmicRobot, rhythmic
 
 if TYPE_CHECKING:
     from softgym_envs.extensions.beams.solver.design import Neighbours
-    from softgym_envs.extensions.walkers.robots.mobile import MobileRobot
 
 TIGHTNESS = 1.0
 """How fast commands follow those of the gait, in their rates over a distance to them of one rate."""
@@ -33,15 +33,11 @@ SHORTER, LONGER = 0.4, 1.5
 FORGET, FORGET_SQUARES = 0.8, 0.95
 """Memory of the mean and of the mean square of gradients (Kingma and Ba 2015), short for a search of a few steps."""
 
-EXCESS = 100.0
-"""Charge for the squares of efforts beyond their limit, over it, in sizes of the robot: far more than they gain."""
-
-
 class GaitConfig(Config):
     """Hyperparameters of the search for a gait (`softgym_envs.extensions.walkers.learners.gait`)."""
 
     period: int = Field(default=10, gt=1, description="control steps of a period")
-    periods: int = Field(default=3, gt=1, description="periods of a motion; the way ahead counts after the first one")
+    periods: int = Field(default=3, gt=0, description="periods of a motion; the way ahead counts after the first one")
     learning_rate: float = Field(
         default=0.1, gt=0, description="first step of a command, in half ranges of the actuator"
     )
@@ -51,7 +47,15 @@ class GaitConfig(Config):
         default=0.05, ge=0, description="by which the seed moves the start away from the reference gait, in half ranges"
     )
     largest_effort: float | None = Field(
-        default=None, gt=0, description="of an actuator [SI]; the search charges for what is beyond"
+        default=None,
+        gt=0,
+        description="of an actuator [SI]; the search charges for what is beyond; default that of the robot, if it has one",
+    )
+    excess: float = Field(
+        default=100.0,
+        ge=0,
+        description="charge for the squares of efforts beyond their limit, over it, in sizes of the robot; the default is "
+        "far more than they gain",
     )
 
 
@@ -63,6 +67,7 @@ class Move(NamedTuple):
         value: way ahead less the charges for the way sideways and for efforts beyond their limit [m].
         rollout: the motion.
         by_x: derivative of the value by the places, for `Rollout.gradient`.
+        by_velocity: likewise by the velocities.
         by_effort: likewise by the efforts; None without a limit.
         follow, pull: derivatives of `GaitLearner.commands`.
     """
@@ -71,6 +76,7 @@ class Move(NamedTuple):
     value: float
     rollout: Rollout
     by_x: np.ndarray
+    by_velocity: np.ndarray
     by_effort: np.ndarray | None
     follow: np.ndarray
     pull: np.ndarray
@@ -157,7 +163,7 @@ def check_compiled(config: TrainConfig, backend: object) -> None:
         raise ValueError(f"learner '{learner}' needs a motion on finite elements in compiled code: {why}")
 
 
-def resampled_gait(robot: MobileRobot, period: int) -> np.ndarray:
+def resampled_gait(robot: RhythmicRobot, period: int) -> np.ndarray:
     """Return where a policy of another period should be after each step of the reference gait, shape (period, n_a).
 
     -1 and 1 are the ends of the ranges of the actuators.
@@ -171,7 +177,7 @@ def resampled_gait(robot: MobileRobot, period: int) -> np.ndarray:
     return np.roll((resampled - middle) / half, -1, axis=0)
 
 
-def shift_of_sides(robot: MobileRobot, gait: np.ndarray) -> int | None:
+def shift_of_sides(robot: RhythmicRobot, gait: np.ndarray) -> int | None:
     """Return by how many control steps one side does later what the other one does in a gait (p, n_a), or None."""
     if robot.mirrored_actuators is None:
         return None
@@ -219,8 +225,10 @@ class GaitLearner(Learner):
         env: Any = config.environment.make().unwrapped
         self.env, backend = env, env.backend
         check_compiled(config, backend)
+        if not hasattr(env.task, "gain"):
+            raise ValueError(f"learner 'gait' needs a task that rates whole motions by `gain`, got '{env.task.name}'")
         self.backend = backend
-        robot = env.robot
+        robot = rhythmic(env.robot)
         self._middle, self._half = 0.5 * (robot.lower + robot.upper), 0.5 * (robot.upper - robot.lower)
         self._gain = TIGHTNESS * self._half / robot.rates
         start = resampled_gait(robot, config.settings.period)
@@ -269,19 +277,15 @@ class GaitLearner(Learner):
         Raises:
             ConvergenceError: if a time step cannot be computed.
         """
-        settings, backend, row = self.config.settings, self.backend, self.env.robot.body_frame
+        settings, backend = self.config.settings, self.backend
         commands, follow, pull = self.commands(settings.period * settings.periods)
         backend.reset()
         parts = backend.steps.count
         rollout = roll_out_backend(backend, commands)
-        begin, end = settings.period * parts - 1, len(commands) * parts - 1
-        way = rollout.x[end, row] - rollout.x[begin, row]
-        by_way = np.array([1.0, -settings.drift * np.sign(way[1]), 0.0])
-        by_x = np.zeros_like(rollout.x)
-        by_x[end, row], by_x[begin, row] = by_way, -by_way
+        begin = settings.period * parts - 1 if settings.periods > 1 else -1
+        gain = self.env.task.gain(rollout, backend.model, begin, settings.drift)
         charge, by_effort = self._excess(rollout.effort)
-        value = float(by_way @ way) - charge
-        return Move(float(way[0]), value, rollout, by_x, by_effort, follow, pull)
+        return Move(gain.way, gain.value - charge, rollout, gain.by_x, gain.by_velocity, by_effort, follow, pull)
 
     def climb(self, neighbours: Neighbours | None = None) -> Climb:
         """Move the body from rest, and return how the gait should change.
@@ -293,7 +297,9 @@ class GaitLearner(Learner):
             ConvergenceError: if a time step cannot be computed.
         """
         moved, parts, period = self.move(), self.backend.steps.count, self.config.settings.period
-        found = moved.rollout.gradient(by_x=moved.by_x, by_effort=moved.by_effort, neighbours=neighbours)
+        found = moved.rollout.gradient(
+            by_x=moved.by_x, by_velocity=moved.by_velocity, by_effort=moved.by_effort, neighbours=neighbours
+        )
         by_command = command_gradient(found.commands, parts)
         gradient, carried = np.zeros_like(self.gait), np.zeros(by_command.shape[1])
         for k in reversed(range(len(by_command))):
@@ -303,13 +309,18 @@ class GaitLearner(Learner):
         return Climb(moved.way, self.straight(gradient), found.design, moved.value)
 
     def _excess(self, effort: np.ndarray) -> tuple[float, np.ndarray | None]:
-        """Return the charge for efforts (k, size) beyond their limit [m], and the derivatives of the value by them."""
-        limit, robot = self.config.settings.largest_effort, self.env.robot
-        if limit is None:
+        """Return the charge for efforts (k, size) beyond their limit [m], and the derivatives of the value by them.
+
+        Recorded motions follow their commands whatever that takes; those of the environment do not.
+        """
+        settings, limit = self.config.settings, self.backend.largest_efforts
+        if settings.largest_effort is not None:
+            limit = np.minimum(limit, settings.largest_effort)
+        if np.isinf(limit).all():
             return 0.0, None
-        count = len(robot.actuators)
+        count = len(limit)
         excess = np.maximum(np.abs(effort[:, :count]) / limit - 1.0, 0.0)
-        by_effort, scale = np.zeros_like(effort), EXCESS * robot.size / len(effort)
+        by_effort, scale = np.zeros_like(effort), settings.excess * self.env.robot.size / len(effort)
         by_effort[:, :count] = -2.0 * scale * excess * np.sign(effort[:, :count]) / limit
         return scale * float((excess**2).sum()), by_effort
 

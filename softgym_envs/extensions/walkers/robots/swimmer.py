@@ -7,31 +7,24 @@ strokes is below 0.3), so that resistive force theory holds.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from softgym_envs.designs import DesignSpace, DesignVariable
+from softgym_envs.extensions.beams.robots.tapered import add_chambers, lay_body
 from softgym_envs.extensions.walkers.fluid import slender_drag
 from softgym_envs.extensions.walkers.robots.mobile import MobileRobot
 from softgym_envs.mechanics.builder import ModelBuilder
-from softgym_envs.mechanics.constraints.chamber import Chamber
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
-from softgym_envs.mechanics.elements.beams import Beam, Section
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.skins import tube_skin
 from softgym_envs.robots.actuator import Actuator
 from softgym_envs.robots.capabilities import View
 
 SEGMENTS = 4
 """Pairs of chambers along the body."""
-CHAMBER_OFFSET, CHAMBER_RADIUS = 0.55, 0.35
-"""Distance of the chambers from the axis and their radius, in radii of the tail."""
-CORNERS = 12
-"""Corners of the sections that are drawn."""
 PERIOD = 20
 """Control steps of a period of the plain gait."""
 STROKE = 3.5e-8
@@ -93,36 +86,25 @@ class Swimmer(MobileRobot):
     def assemble(self, design: Mapping[str, float]) -> MechanicalModel:
         """Lay the body along x with its middle at the origin."""
         length, radius, taper = design["length"], design["radius"], design["taper"]
-        count, order = self.elements, 2
-        active = (1.0 - design["tail"]) * length
-        ends = np.concatenate(
-            [np.linspace(0.0, active, SEGMENTS * count + 1), np.linspace(active, length, count + 1)[1:]]
-        )
-        places = np.interp(np.arange(order * (len(ends) - 1) + 1) / order, np.arange(len(ends)), ends)
         builder = ModelBuilder(gravity=self.gravity, floating=True)
         # From head to tail: the first director runs backwards, the second one to the left.
         turn = np.column_stack([[-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]])
-        radii = radius * (1.0 - (1.0 - taper) * places / length)
-        sections = [Section.circle(r) for r in radii[1::order]]
-        frames = [builder.add_frame((0.5 * length - place, 0.0, 0.0), turn) for place in places]
-        drag = slender_drag(self.viscosity, length, 0.5 * radius * (1.0 + taper))
-        builder.add_beam(
-            frames, section=sections, young_modulus=design["young_modulus"], poisson_ratio=0.45, density=970.0,
-            drag=drag,
-        )  # fmt: skip
+        frames, radii = lay_body(
+            builder,
+            design,
+            (0.5 * length, 0.0, 0.0),
+            turn,
+            segments=SEGMENTS,
+            elements=self.elements,
+            young_modulus=design["young_modulus"],
+            poisson_ratio=0.45,
+            density=970.0,
+            drag=slender_drag(self.viscosity, length, 0.5 * radius * (1.0 + taper)),
+        )
         model = builder.build()
-        (beam,) = (block for block in model.blocks if isinstance(block, Beam))
-        thin = radius * taper
-        for k, actuator in enumerate(self.actuators):
-            segment, side = divmod(k, 2)
-            offset = CHAMBER_OFFSET * thin * (1.0 if side == 0 else -1.0)
-            line = beam.line(range(segment * count, (segment + 1) * count), (offset, 0.0), model.nodes)
-            model.add("a", Chamber(actuator.name, [line], math.pi * (CHAMBER_RADIUS * thin) ** 2))
         middle = frames[len(frames) // 2]
+        add_chambers(model, radii, self.actuators, self.elements)
         model.add("e", Point("middle", EmbeddedPoints.in_frame(middle, np.zeros(3), model.nodes)))
-        angles = 2.0 * np.pi * np.arange(CORNERS) / CORNERS
-        circle = np.column_stack([np.cos(angles), np.sin(angles)])
-        model.skins.append(tube_skin(beam, model.nodes, radii[:, None, None] * circle))
         return model
 
     def place(self, nodes: np.ndarray) -> np.ndarray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,6 +14,10 @@ from softgym_envs.envs.arrays import Array
 from softgym_envs.envs.tasks.base import DistanceScale, Kinematics, Random, Sensors, Task
 from softgym_envs.extensions.walkers.robots.mobile import MobileRobot
 from softgym_envs.units import effort_unit, present
+
+if TYPE_CHECKING:
+    from softgym_envs.extensions.beams.rollout import Gain, Rollout
+    from softgym_envs.mechanics.model import MechanicalModel
 
 SHORTEST = 1.0
 """Shortest time over which speeds are averaged [s]: at the start of an episode there is no second half yet."""
@@ -251,6 +256,29 @@ class Locomotion(Task):
         ahead, across = _along(pace.velocity, self.turn_to()[0])
         found = {"speed": float(ahead), "drift": float(abs(across)), "slip": pace.slip, "power": pace.power}
         return {name: found[name] for name in self.tallies}
+
+    def gain(self, rollout: Rollout, model: MechanicalModel, begin: int, drift: float) -> Gain:
+        """Return the way along x of the body's frame in a motion, less a charge for that sideways, with derivatives.
+
+        Args:
+            rollout: the motion.
+            model: the body.
+            begin: time step after which the way counts.
+            drift: charge for the way sideways, over the way ahead.
+
+        Raises:
+            ValueError: for a motion of which all counts: its beginning from rest is no gait.
+        """
+        from softgym_envs.extensions.beams.rollout import Gain
+
+        if begin < 0:
+            raise ValueError("the way of a gait counts after its first period: periods must be at least 2")
+        row = self.robot.body_frame
+        way = rollout.x[-1, row] - rollout.x[begin, row]
+        by_way = np.array([1.0, -drift * np.sign(way[1]), 0.0])
+        by_x = np.zeros_like(rollout.x)
+        by_x[-1, row], by_x[begin, row] = by_way, -by_way
+        return Gain(float(way[0]), float(by_way @ way), by_x, np.zeros_like(rollout.x))
 
     def distance(self, effector: Array, goal: Array) -> Array:
         speed = np.linalg.norm(goal, axis=-1)

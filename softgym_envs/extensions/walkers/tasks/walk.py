@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from softgym_envs.backends.backend import Ground, State
-from softgym_envs.envs.tasks.base import Load, check_force
+from softgym_envs.envs.tasks.base import Load, check_force, check_range
 from softgym_envs.extensions.walkers.robots.mobile import MobileRobot
 from softgym_envs.extensions.walkers.tasks.locomotion import Locomotion
 from softgym_envs.mechanics.contact.contact import Contacts
@@ -96,8 +96,10 @@ class Walk(Locomotion):
         check_force(push, "push", robot)
         high, example = plausible_mass(robot)
         check_quantity("mass", payload, "payload", high=high, example=example)
-        self.friction = None if friction is None else _ends("friction", friction, "", 0.01, QUANTITIES["friction"].high)
-        self.slope = _ends("slope", slope, " rad", -STEEPEST, STEEPEST)
+        self.friction = (
+            None if friction is None else check_range("friction", friction, "", 0.01, QUANTITIES["friction"].high)
+        )
+        self.slope = check_range("slope", slope, "rad", -STEEPEST, STEEPEST)
         if self.friction is not None and max(map(abs, self.slope)) >= np.arctan(self.friction[0]):
             raise ValueError(
                 f"slope = {slope} rad is too steep for friction = {friction}; allowed: below "
@@ -150,21 +152,3 @@ def _slipped(before: Contacts, now: Contacts) -> float:
     if not load.any():
         return 0.0
     return float(load @ np.linalg.norm((now.point[new] - before.point[old])[:, :2], axis=1) / load.sum())
-
-
-def _ends(name: str, given: float | Sequence[float], unit: str, low: float, high: float) -> tuple[float, float]:
-    """Return the ends of a range that is given by a number or by two.
-
-    Raises:
-        ValueError: for anything else, or ends out of bounds.
-    """
-    try:
-        ends = np.asarray(given, dtype=float)
-    except (TypeError, ValueError):
-        ends = np.full(3, np.nan)
-    pair = np.broadcast_to(ends, 2) if ends.shape in ((), (2,)) else np.full(2, np.nan)
-    if not low <= pair[0] <= pair[1] <= high:
-        raise ValueError(
-            f"{name} = {given}{unit} must be a number or a range (low, high); allowed: {low:g} to {high:g}{unit}"
-        )
-    return float(pair[0]), float(pair[1])
