@@ -48,7 +48,7 @@ class Whip(Robot):
     size = 0.25
     made_of_beams = True
     goal_axes = np.array([1.0, 0.0, 1.0])
-    view = View(axes=(0, 2, 1))
+    view = View(turned=True, way=2.0)
     workspace_scale = 0.1
 
     def __init__(
