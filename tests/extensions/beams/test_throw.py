@@ -103,8 +103,8 @@ def test_the_throw_has_no_more_energy_than_the_drives_gave(thrown):
     hanging = model.elastic_energy(rest.nodes) - (model.loads * (rest.nodes - model.nodes)).sum()
     gained = motion.energy - hanging
     assert 0.0 < payload < gained < motion.work
-    # Implicit Euler damps, by less than the material does.
-    assert 0.0 < motion.work - gained - motion.dissipated < 0.2 * motion.dissipated
+    # Implicit Euler damps, by less than half of what the material does.
+    assert 0.0 < motion.work - gained - motion.dissipated < 0.5 * motion.dissipated
 
 
 def test_no_chamber_has_more_than_its_largest_pressure():
