@@ -29,7 +29,7 @@ from softgym_envs.storage import read_json, write_json
 ID = "SoftGym/WhipThrow-v0"
 GOALS = np.tile([0.5, 0.0, -0.6], (6, 1))
 BODIES, STEPS, ROLLOUTS, THROW = 11, 1800, 80, 30
-GAIT = {"period": THROW, "periods": 1, "learning_rate": 0.2, "overload": 3.0}
+GAIT = {"period": THROW, "periods": 1, "learning_rate": 0.2, "excess": 5.0}
 OTHERS: tuple[dict[str, Any], ...] = (
     {"robot_options": {"elements": 4}},
     {"backend_options": {"time_step": 0.001}},

@@ -16,14 +16,5 @@ ENVIRONMENTS = {
         backend_options=DYNAMIC,
         robot_options={"mesh": "accurate", "servo_range": 2.8},
     ),
-    # Shorter time steps than elsewhere: implicit Euler with the usual ones damps the swing.
-    "SoftGym/WhipThrow-v0": environment_row(
-        "whip",
-        "throw",
-        30,
-        backend="fem",
-        backend_options=DYNAMIC | {"time_step": 0.002},
-        task_options={"payload": [0.015, 0.025]},
-    ),
 }
 """Rows by ID."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from softgym_envs.agents.policy import Policy
 from softgym_envs.errors import WeightsError
-from softgym_envs.extensions.walkers.robots.mobile import mobile
+from softgym_envs.extensions.walkers.robots.mobile import mobile, rhythmic
 
 STEERING = 1.5
 """Steering of a gait, over the angle from where the robot faces to its heading [1/rad]."""
@@ -38,7 +38,7 @@ class GaitAgent:
         """Return the action that leads towards the next command of the gait, shape (n_a,)."""
         robot, spaces = env.robot, env.spaces
         if self._clock is None:
-            gait = self.led(mobile(robot).reference_gait(), env)
+            gait = self.led(rhythmic(robot).reference_gait(), env)
             action: np.ndarray = spaces.action(gait[(env.steps + 1) % len(gait)], env.command)
             return action
         if self._clock.shape[1] != len(robot.actuators):

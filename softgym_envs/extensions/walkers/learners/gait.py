@@ -33,6 +33,7 @@ SHORTER, LONGER = 0.4, 1.5
 FORGET, FORGET_SQUARES = 0.8, 0.95
 """Memory of the mean and of the mean square of gradients (Kingma and Ba 2015), short for a search of a few steps."""
 
+
 class GaitConfig(Config):
     """Hyperparameters of the search for a gait (`softgym_envs.extensions.walkers.learners.gait`)."""
 
@@ -49,13 +50,13 @@ class GaitConfig(Config):
     largest_effort: float | None = Field(
         default=None,
         gt=0,
-        description="of an actuator [SI]; the search charges for what is beyond; default that of the robot, if it has one",
+        description="of an actuator [SI], if less than that of the robot; the search charges for what is beyond",
     )
     excess: float = Field(
         default=100.0,
         ge=0,
-        description="charge for the squares of efforts beyond their limit, over it, in sizes of the robot; the default is "
-        "far more than they gain",
+        description="charge for squares of efforts beyond their limit, over it, in sizes of the robot; the default is far "
+        "more than they gain",
     )
 
 

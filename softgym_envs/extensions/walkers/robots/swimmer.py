@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.designs import DesignSpace, DesignVariable
-from softgym_envs.extensions.beams.robots.tapered import add_chambers, lay_body
 from softgym_envs.extensions.walkers.fluid import slender_drag
 from softgym_envs.extensions.walkers.robots.mobile import MobileRobot
+from softgym_envs.extensions.walkers.robots.tapered import add_chambers, lay_body
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point

@@ -10,6 +10,7 @@ import numpy as np
 from softgym_envs.backends.backend import Ground, State
 from softgym_envs.envs.arrays import Array, namespace
 from softgym_envs.envs.tasks.base import DistanceScale, Kinematics, Random, Sensors, Task, check_range
+from softgym_envs.extensions.walkers.robots.mobile import MobileRobot
 from softgym_envs.robots.base import Robot
 from softgym_envs.robots.checks import plausible_mass
 from softgym_envs.units import effort_unit, present
@@ -120,7 +121,7 @@ class Throw(Task):
     ) -> None:
         super().__init__(robot)
         gravity = np.asarray(robot.gravity, dtype=float)
-        if robot.body_frame is not None or not np.allclose(gravity, [0.0, 0.0, -GRAVITY]):
+        if isinstance(robot, MobileRobot) or not np.allclose(gravity, [0.0, 0.0, -GRAVITY]):
             raise ValueError(
                 f"task 'throw' needs a mounted robot with gravity = (0, 0, -{GRAVITY}), got '{robot.name}' with "
                 f"{tuple(gravity.tolist())}"

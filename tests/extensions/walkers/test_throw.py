@@ -18,8 +18,8 @@ from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.codesign.metrics.metric import METRICS
 from softgym_envs.codesign.metrics.sources import Outcome
 from softgym_envs.envs.tasks.registry import make_task
-from softgym_envs.extensions.beams.throw import landing
 from softgym_envs.extensions.walkers.learners.gait import GaitLearner
+from softgym_envs.extensions.walkers.tasks.throw import landing
 
 ID = "SoftGym/WhipThrow-v0"
 FIXED = {"task_options": {"payload": 0.02}}

@@ -13,13 +13,14 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.designs import DesignSpace, DesignVariable
-from softgym_envs.extensions.beams.robots.tapered import add_chambers, lay_body
+from softgym_envs.extensions.walkers.robots.mobile import RhythmicRobot
+from softgym_envs.extensions.walkers.robots.tapered import add_chambers, lay_body
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.elements.rigid import sphere_inertia
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.robots.base import Actuator, Robot
+from softgym_envs.robots.actuator import Actuator
 from softgym_envs.robots.capabilities import View
 
 SEGMENTS = 2
@@ -30,7 +31,7 @@ STROKE, SWINGS, THROW = 3e-8, 2.0, 30
 """Volume by which chambers change in the plain throw [m3], its swings, and its duration [control steps]."""
 
 
-class Whip(Robot):
+class Whip(RhythmicRobot):
     """A trunk that hangs, bends in the plane of x and z, and holds a payload at its end.
 
     Opposite changes of the volumes of a segment bend it to one side; equal ones stretch it. No chamber holds or draws
