@@ -55,7 +55,7 @@ class GaitConfig(Config):
     excess: float = Field(
         default=100.0,
         ge=0,
-        description="charge for squares of efforts beyond their limit, over it, in sizes of the robot; the default is far "
+        description="charge for squares of efforts beyond their limit, over it, in sizes of the robot; by default far "
         "more than they gain",
     )
 
