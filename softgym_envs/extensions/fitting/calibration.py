@@ -377,7 +377,8 @@ def cross_validated(model: SurrogateModel, states: StratifiedStates, folds: int 
         parts.append(predict(_calibrated(model, calibration, limit), states.rows(left_out)))
         order.append(np.flatnonzero(left_out))
     back = np.argsort(np.concatenate(order))
-    every = Predictions(*(np.concatenate([getattr(part, f.name) for part in parts])[back] for f in fields(Predictions)))
+    columns = [[getattr(part, f.name) for part in parts] for f in fields(Predictions)]
+    every = Predictions(*(np.concatenate(column)[back] for column in columns if column[0] is not None))
     return by_stratum(every, states)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from softgym_envs.extensions.fitting.data.strata import StratifiedStates
+from softgym_envs.extensions.fitting.data.strata import SLACK, StratifiedStates
 from softgym_envs.surrogate.model import SurrogateModel
 
 TOUCHING = "touching"
@@ -26,6 +26,7 @@ class Predictions:
         trusted: shape (N,).
         growth: predicted growth (see `Domain`), shape (N,); 1 for robots that do not buckle.
         found: the model and FEM both have an equilibrium, shape (N,).
+        slack: the same actuators are slack as on FEM, shape (N,); None where nobody asked.
     """
 
     error: np.ndarray
@@ -34,6 +35,7 @@ class Predictions:
     trusted: np.ndarray
     growth: np.ndarray
     found: np.ndarray
+    slack: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,7 @@ class StratumReport:
         lost: commands without an equilibrium on FEM; they do not count in any of the above.
         unsolved: those of them that are trusted.
         missed: commands with an equilibrium on FEM that the model does not find; they do not count either.
+        slack: share of the states in which the same actuators are slack as on FEM; None where nobody asked.
     """
 
     states: int
@@ -61,6 +64,7 @@ class StratumReport:
     lost: int
     unsolved: int
     missed: int
+    slack: float | None = None
 
 
 def reached(model: SurrogateModel, context: Any, command: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -80,7 +84,9 @@ def predict(model: SurrogateModel, states: StratifiedStates) -> Predictions:
     off = (effector - states.effector).reshape(len(states), -1, 3)
     growth = model.softening_ratio(context, displacement) if model.domain.limits_growth else np.ones(len(states))
     error = np.linalg.norm(off, axis=2).max(axis=1)
-    return Predictions(error, spread, uncertainty, trusted & found, growth, found & states.found)
+    beyond = displacement > states.command + SLACK * (model.robot.upper - model.robot.lower)
+    slack = ((model.robot.unilateral & beyond) == states.slack).all(axis=1)
+    return Predictions(error, spread, uncertainty, trusted & found, growth, found & states.found, slack)
 
 
 def report(model: SurrogateModel, states: StratifiedStates) -> dict[str, StratumReport]:
@@ -108,5 +114,6 @@ def _report(every: Predictions, states: StratifiedStates, which: np.ndarray) -> 
         worst_trusted=float(every.error[rows & every.trusted].max(initial=0.0)),
         lost=int((which & ~states.found).sum()),
         unsolved=int((every.trusted & ~states.found & which).sum()),
+        slack=None if every.slack is None else float(every.slack[rows].mean()),
         missed=int((which & states.found & ~every.found).sum()),
     )

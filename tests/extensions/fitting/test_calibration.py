@@ -296,6 +296,16 @@ def test_bodies_that_are_left_out_are_judged_by_the_others(trunk):
     assert rows["inside"].coverage <= 0.9
 
 
+def test_reports_count_the_states_whose_slack_actuators_are_told():
+    model = pretrained_model(make_robot("finger"))
+    states = predicted_states(model, "slack corners", 4, 5, seed=3)
+    assert states.slack.any()
+    states.slack[:] = states.displacement > states.command + 1e-6 * (model.robot.upper - model.robot.lower)
+    assert report(model, states)["slack corners"].slack == 1.0
+    states.slack[7, 1] = ~states.slack[7, 1]
+    assert report(model, states)["slack corners"].slack == 0.95
+
+
 def test_the_limit_is_below_all_wrong_states():
     def judged(error, uncertainty, found=None, trusted=None):
         error = np.array(error)
