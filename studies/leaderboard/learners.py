@@ -1,4 +1,4 @@
-"""How strong must a learner be to judge bodies that move? Bodies under the plain gait, and under gaits of more gradients.
+"""How strong must a learner be to judge bodies that move? The plain gait, and gaits of more and more gradients.
 
     python studies/leaderboard/learners.py swimmer-swim-v1 results/learners
 
