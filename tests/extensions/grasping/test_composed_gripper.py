@@ -307,10 +307,10 @@ def test_one_learned_finger_makes_every_gripper(fingers):
     design = {"fingers": fingers, "spacing": 0.055, "angle": 0.2, "length": 0.0395, "poisson_ratio": 0.42}
     learned, whole = FingersBackend(robot, design), FEMBackend(robot, design)
     expected, found = whole.step(0.6 * COMMAND), learned.step(0.6 * COMMAND)
-    assert np.linalg.norm(found.effector - expected.effector) < 1e-3
-    assert np.abs(found.effort - expected.effort).max() < 0.05 * expected.effort.max()
+    assert np.linalg.norm(found.effector - expected.effector) < 2e-4
+    assert np.abs(found.effort - expected.effort).max() < 0.02 * expected.effort.max()
     np.testing.assert_array_equal(found.slack, expected.slack)
-    assert 0.0 < found.uncertainty < 1e-3
+    assert 0.0 < found.uncertainty < 5e-4 and found.trusted
 
 
 def test_the_stiffness_of_the_material_scales_efforts(model):
