@@ -21,7 +21,6 @@ ROOT = Path(__file__).parent.parent
 
 REWRITTEN = {
     "studies/contact_aided_finger/results.json zigzag_robust",
-    "softgym_envs/extensions/leaderboard/data/references/cable-trunk-reach-v2.json found",
     "softgym_envs/extensions/grasping/chain/weights/contact_aided_finger/model.json provenance",
     "softgym_envs/extensions/sensing/weights/sensorized_finger_2cavities_touched/model.json provenance",
 }

@@ -103,7 +103,7 @@ def test_factors_are_interpolated_between_strata():
 
 def test_poisson_ratios_are_trusted_up_to_those_of_the_training():
     """The margin is 1 % of the training's range of ``log(1 - 2 nu)``: a linear one would end beyond 0.499."""
-    model = pretrained_model(make_robot("cable_trunk"))
+    model = pretrained_model(make_robot("diamond"))
     space, domain = model.robot.design_space, model.domain
     low, high = model.card["domain"]["design"]["poisson_ratio"]
     k = space.names.index("poisson_ratio")
