@@ -24,6 +24,7 @@ PACKAGES = {
     "softgym_envs.viewer": "Pictures",
     "softgym_envs.agents": "Agents",
     "softgym_envs.codesign": "Co-design",
+    "softgym_envs.extensions.beams": "Extension: bodies of beams",
     "softgym_envs.extensions.design": "Extension: design without a controller",
     "softgym_envs.extensions.fitting": "Extension: fitting of surrogates",
     "softgym_envs.extensions.gpu": "Extension: environments on tensors",

@@ -15,7 +15,7 @@ from softgym_envs import make_robot
 from softgym_envs.backends import make_backend
 from softgym_envs.envs.registration import ENVIRONMENTS
 from softgym_envs.errors import WeightsError
-from softgym_envs.mechanics.elements.beams import Beam
+from softgym_envs.extensions.beams.beam import Beam
 from softgym_envs.mechanics.elements.block import ElementBlock
 from softgym_envs.mechanics.elements.tetrahedra import SolidBlock
 from softgym_envs.robots import ROBOTS, Actuator, Robot

@@ -14,10 +14,10 @@ from scipy.sparse import csc_matrix
 from scipy.spatial.transform import Rotation
 
 from softgym_envs.designs import DesignSpace, DesignVariable
+from softgym_envs.extensions.beams.beam import Beam, Section
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.contact.contact import ContactState
-from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Actuator, Robot
 
@@ -96,7 +96,8 @@ def clamped_beam(order: int = 1, shape: str = "straight", elements: int = 3, **o
             rotation = np.column_stack([tangent, normal, np.cross(tangent, normal)])
         frames.append(builder.add_frame(position, rotation, fixed=k == 0, fixed_spin=k == 0))
     young = 1e6 * (1.0 + np.arange(elements))
-    builder.add_beam(
+    builder.add_element(
+        Beam,
         frames,
         section=ASYMMETRIC_SECTION,
         young_modulus=young,

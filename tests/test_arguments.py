@@ -11,7 +11,8 @@ from softgym_envs import DesignSpace, DesignVariable
 from softgym_envs.arguments import _is_raised, choice, explained, is_a
 from softgym_envs.backends import make_backend
 from softgym_envs.errors import SoftGymError
-from softgym_envs.mechanics import MechanicalModel, Section, Statics
+from softgym_envs.extensions.beams import Beam, Section, add_rod
+from softgym_envs.mechanics import MechanicalModel, Statics
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.contact.contact import ContactSettings
 from softgym_envs.mechanics.io import read_mesh
@@ -55,15 +56,20 @@ def builder(method, **arguments):
 def beam(**options):
     made = ModelBuilder()
     given = {"section": Section.circle(5e-3), "young_modulus": 1e6, **options}
-    made.add_beam([made.add_frame([x, 0.0, 0.0], fixed=x == 0.0) for x in (0.0, 0.05, 0.1)], **given)
+    made.add_element(Beam, [made.add_frame([x, 0.0, 0.0], fixed=x == 0.0) for x in (0.0, 0.05, 0.1)], **given)
     return made.build()
 
 
 def rod(**options):
     made = ModelBuilder()
     given = {"section": Section.circle(5e-4), "elements": 10, "up": [1, 0, 0], "young_modulus": 1e9, **options}
-    made.add_rod([[0, 0, 0], [0, 0, 0.2]], **given)
-    return made.build()
+    rod = add_rod(made, **{"path": [[0, 0, 0], [0, 0, 0.2]], **given})
+    return made.build(), rod
+
+
+def tendon(*arguments, **options):
+    model, made = rod()
+    return made.add_tendon(model, *arguments, **options)
 
 
 def solved(**arguments):
@@ -102,8 +108,8 @@ ENTRIES = {
     "add_beam": (beam, {"section", "young_modulus", "order", "density"}),
     "add_rod": (rod, {"section", "elements", "up", "young_modulus", "held"}),
     "add_tendon": (
-        lambda **a: rod().add_tendon(**{"name": "t", "places": [0.1, 0.2], "offsets": [0.004, 0.0], **a}),
-        {"name", "places", "offsets", "rod", "compliance", "unilateral"},
+        lambda **a: tendon(**{"name": "t", "places": [0.1, 0.2], "offsets": [0.004, 0.0], **a}),
+        {"name", "places", "offsets", "compliance", "unilateral"},
     ),
     "Statics": (lambda **a: Statics(**{"model": body(), **a}), {"model", "tolerance", "max_iterations"}),
     "solve": (solved, {"target", "mode", "effector_force", "contact_mode"}),
@@ -169,7 +175,7 @@ def test_errors_of_a_callers_code_keep_their_traceback():
     with pytest.raises(ValueError, match=r"^operands could not be broadcast"):
         scale([1, 2])
     with pytest.raises(ValueError, match=r"tendon cannot take name = 't', places = \[\[0.1\]\], offsets = .*broadcast"):
-        rod().add_tendon("t", [[0.1]], np.zeros((3, 3)))
+        tendon("t", [[0.1]], np.zeros((3, 3)))
     with pytest.raises(TypeError, match="unexpected keyword argument 'nme'"):
         scale([1.0], nme="x")
 

@@ -18,6 +18,7 @@ PACKAGES = [
     "softgym_envs.codesign",
     "softgym_envs.control",
     "softgym_envs.envs",
+    "softgym_envs.extensions.beams",
     "softgym_envs.extensions.deployment",
     "softgym_envs.extensions.design",
     "softgym_envs.extensions.fitting",

@@ -17,12 +17,12 @@ from softgym_envs.agents.config import EnvironmentConfig
 from softgym_envs.backends import make_backend
 from softgym_envs.backends.backend import PointForce
 from softgym_envs.config import load_config
+from softgym_envs.extensions.beams.beam import Beam, Section
 from softgym_envs.extensions.sensing.loads import Payload, Touch, finger_grid
 from softgym_envs.mechanics import MechanicalModel
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.contact.contact import ContactSettings
 from softgym_envs.mechanics.contact.obstacles import MeshObstacle, Plane, Sphere
-from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.quantities import QUANTITIES, check_quantity, check_unit
 from softgym_envs.robots import Actuator, Robot
 from tests.helpers import box_mesh
@@ -76,7 +76,7 @@ def scaled(factor):
 def beam(**options):
     builder = ModelBuilder()
     frames = [builder.add_frame([x, 0.0, 0.0], fixed=x == 0.0) for x in (0.0, 0.05, 0.1)]
-    builder.add_beam(frames, section=Section.circle(5e-3), young_modulus=3e7, **options)
+    builder.add_element(Beam, frames, section=Section.circle(5e-3), young_modulus=3e7, **options)
     return builder.build()
 
 

@@ -20,6 +20,7 @@ from softgym_envs.backends import make_backend
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.config import load_config
 from softgym_envs.errors import SoftGymError
+from softgym_envs.extensions.beams.beam import Beam, Section
 from softgym_envs.extensions.design import measure
 from softgym_envs.extensions.design.config import CalibrationConfig, OptimiseConfig
 from softgym_envs.extensions.fitting.training import FitConfig
@@ -29,7 +30,6 @@ from softgym_envs.mechanics import MechanicalModel
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
-from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.robots import Actuator, Robot
 from softgym_envs.storage import cache_directory
 from tests.helpers import box_mesh
@@ -61,7 +61,7 @@ class Leg(Robot):
     def assemble(self, design):
         builder = ModelBuilder()
         frames = [builder.add_frame([x, 0.0, 0.0], fixed=x == 0.0) for x in (0.0, 0.05, 0.1)]
-        builder.add_beam(frames, section=Section.circle(5e-3), young_modulus=design["modulus"], order=2)
+        builder.add_element(Beam, frames, section=Section.circle(5e-3), young_modulus=design["modulus"], order=2)
         model = builder.build()
         for role, name in (("a", "push"), ("e", "tip")):
             model.add(role, Point(name, EmbeddedPoints.in_frame(frames[-1], np.zeros(3), model.nodes)))

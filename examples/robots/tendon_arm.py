@@ -3,7 +3,8 @@
 import numpy as np
 
 from softgym_envs import DesignSpace, DesignVariable
-from softgym_envs.mechanics import ModelBuilder, Section
+from softgym_envs.extensions.beams import Section, add_rod
+from softgym_envs.mechanics import ModelBuilder
 from softgym_envs.robots import Actuator, Robot
 
 
@@ -31,11 +32,11 @@ class TendonArm(Robot):
         builder = ModelBuilder(gravity=self.gravity)
         section = Section.circle(design["radius"])
         path = [[0, 0, 0], [0, 0, length]]
-        builder.add_rod(path, section=section, elements=discs, young_modulus=6e10, density=6450)
+        rod = add_rod(builder, path, section=section, elements=discs, young_modulus=6e10, density=6450)
         model = builder.build()
         for k, name in enumerate(self.near + self.far):
             angle = 2.0 * np.pi / 3.0 * k + (np.pi / 3.0 if name in self.far else 0.0)
             offset = design["offset"] * np.array([np.cos(angle), np.sin(angle)])
-            model.add_tendon(name, discs[1:11] if name in self.near else discs[1:], offset)
-        model.add_effector("tip", model.rods[0].points(length, (0.0, 0.0), model.nodes))
+            rod.add_tendon(model, name, discs[1:11] if name in self.near else discs[1:], offset)
+        model.add_effector("tip", rod.points(length, (0.0, 0.0), model.nodes))
         return model

@@ -8,17 +8,14 @@ if TYPE_CHECKING:
     from softgym_envs.mechanics.builder import ModelBuilder as ModelBuilder
     from softgym_envs.mechanics.condensation import CondensedModel as CondensedModel
     from softgym_envs.mechanics.constraints.bond import Bond as Bond
-    from softgym_envs.mechanics.constraints.chamber import Chamber as Chamber
     from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints as EmbeddedPoints
     from softgym_envs.mechanics.constraints.point import Point as Point
-    from softgym_envs.mechanics.constraints.servo import Servo as Servo
     from softgym_envs.mechanics.constraints.slide import Slide as Slide
     from softgym_envs.mechanics.contact.obstacles import Cylinder as Cylinder
     from softgym_envs.mechanics.contact.obstacles import MeshObstacle as MeshObstacle
     from softgym_envs.mechanics.contact.obstacles import Plane as Plane
     from softgym_envs.mechanics.contact.obstacles import RoundedPrism as RoundedPrism
     from softgym_envs.mechanics.contact.obstacles import Sphere as Sphere
-    from softgym_envs.mechanics.elements.beams import Section as Section
     from softgym_envs.mechanics.io import read_mesh as read_mesh
     from softgym_envs.mechanics.mesh_checks import merge_nodes as merge_nodes
     from softgym_envs.mechanics.model import MechanicalModel as MechanicalModel
@@ -31,13 +28,10 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "builder": ["ModelBuilder"],
         "condensation": ["CondensedModel"],
         "constraints.bond": ["Bond"],
-        "constraints.chamber": ["Chamber"],
         "constraints.embedding": ["EmbeddedPoints"],
         "constraints.point": ["Point"],
-        "constraints.servo": ["Servo"],
         "constraints.slide": ["Slide"],
         "contact.obstacles": ["Cylinder", "MeshObstacle", "Plane", "RoundedPrism", "Sphere"],
-        "elements.beams": ["Section"],
         "io": ["read_mesh"],
         "mesh_checks": ["merge_nodes"],
         "model": ["MechanicalModel"],

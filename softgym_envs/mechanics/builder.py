@@ -1,12 +1,11 @@
-"""ModelBuilder: combines solids, beams and rigid parts into one model."""
+"""ModelBuilder: combines solids, elements between frames, and rigid parts into one model."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from softgym_envs.arguments import explained
 from softgym_envs.mechanics.elements.block import ElementBlock
@@ -14,9 +13,6 @@ from softgym_envs.mechanics.frames import frame_rows
 from softgym_envs.mechanics.mesh_checks import check_apart
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solids import Fixed, are_rows, described, solid_part
-
-if TYPE_CHECKING:
-    from softgym_envs.mechanics.elements.beams import Section
 
 
 @explained
@@ -43,7 +39,7 @@ class ModelBuilder:
         self._mounted: dict[int, list[int]] = {}
         self._parts: list[tuple[type[ElementBlock], np.ndarray, dict[str, object]]] = []
         self._solids: list[np.ndarray] = []  # corners of those that may not overlap
-        self._rods: list[tuple[int, np.ndarray, np.ndarray | None]] = []  # part, places of frames, outlines
+        self._finishes: list[Callable[[MechanicalModel], None]] = []
         self.size = 0
 
     def _append(self, rows: np.ndarray, fixed: np.ndarray) -> int:
@@ -122,76 +118,15 @@ class ModelBuilder:
             [self._carried.get(index, np.empty(0, dtype=np.int64)), rows.astype(np.int64)]
         )
 
-    def add_beam(self, frames: Sequence[int] | np.ndarray, *, section: Section | list[Section], **options) -> None:
-        """Add beam elements along frames that were added before; options as for `Beam`."""
-        known = {*self._frames, *(row for rows in self._mounted.values() for row in rows)}
-        unknown = [int(row) for row in frames if int(row) not in known]
-        if unknown:
-            raise ValueError(
-                f"row {unknown[0]} of the beam is not a frame's first row; frames start at rows {sorted(known)}"
-            )
-        from softgym_envs.mechanics.elements.beams import Beam
-
-        self._parts.append((Beam, np.asarray(frames, dtype=np.int64), {"section": section, **options}))
-
-    def add_rod(
-        self,
-        path: ArrayLike,
-        *,
-        section: Section | Callable[[float], Section],
-        elements: int | Sequence[float] | np.ndarray = 10,
-        order: int = 2,
-        up: ArrayLike | None = None,
-        held: str = "start",
-        **options: Any,
-    ) -> list[int]:
-        """Add a rod: beam elements along a line, with the surface of its sections; the next of the model's `rods`.
-
-        Args:
-            path: both ends of a straight rod [m], shape (2, 3), or all frames of a curved one, shape (c, 3). The rod is
-                free of stress in this shape.
-            section: of all elements, or a function of the place along the rod [m] that returns that of the element with
-                its middle there.
-            elements: of a straight rod: a number of equal ones, or their ends along the rod [m], e.g. at its discs.
-            order: 1 or 2, see `Beam`; with 2 every second frame is the middle of an element.
-            up: direction of d_2 at the start; default: the axis of space that is least along the rod.
-            held: which ends are clamped: ``"start"``, ``"both"`` or ``"none"``.
-            **options: ``young_modulus`` and others of `Beam`.
-
-        Returns:
-            First rows of its frames.
-
-        Raises:
-            ValueError: for a path or elements that describe no rod.
-        """
-        from softgym_envs.mechanics.elements.beams import Section
-        from softgym_envs.mechanics.rods import ENDS, outlines, straight_places, transported_frames
-
-        points = np.asarray(path, dtype=float)
-        if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2 or not np.isfinite(points).all():
-            raise ValueError(f"the path of a rod must be two or more points [m] of three finite numbers, got {path!r}")
-        if held not in ENDS:
-            raise ValueError(f"held = {held!r} is unknown; allowed: {', '.join(ENDS)}")
-        if len(points) == 2:
-            places = straight_places(float(np.linalg.norm(points[1] - points[0])), elements, order)
-            points = points[0] + (places / places[-1])[:, None] * (points[1] - points[0])
-        else:
-            places = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-        clamped = np.isin(np.arange(len(points)), np.array(ENDS[held], dtype=int) % len(points))
-        frames = [
-            self.add_frame(point, rotation, fixed=bool(fix), fixed_spin=bool(fix))
-            for point, rotation, fix in zip(points, transported_frames(points, up), clamped, strict=True)
-        ]
-        middles = 0.5 * (places[:-order:order] + places[order::order])
-        sections = section if isinstance(section, Section) else [section(float(s)) for s in middles]
-        self.add_beam(frames, section=sections, order=order, **options)
-        self._rods.append((len(self._parts) - 1, places, outlines(section, places)))
-        return frames
-
     def add_element(
-        self, kind: type[ElementBlock], frames: Sequence[int], *, own: Sequence[Sequence[bool]] = (), **options: Any
-    ) -> None:
-        """Add an element of any class between frames.
+        self,
+        kind: type[ElementBlock],
+        frames: Sequence[int] | np.ndarray,
+        *,
+        own: Sequence[Sequence[bool]] = (),
+        **options: Any,
+    ) -> int:
+        """Add an element of any class between frames, such as a `Beam` along them; return the number of its block.
 
         Args:
             kind: its class, made as ``kind(nodes, rows, **options)``.
@@ -200,17 +135,23 @@ class ModelBuilder:
                 the frames, and rest at zero.
             **options: of the class.
         """
+        known = {*self._frames, *(row for rows in self._mounted.values() for row in rows)}
         for row in frames:
-            if row not in self._frames:
-                raise ValueError(f"row {row} is not the first row of a frame; frames start at rows {self._frames}")
+            if int(row) not in known:
+                raise ValueError(f"row {row} is not the first row of a frame; frames start at rows {sorted(known)}")
         start = self._append(np.zeros((len(own), 3)), np.array(own, dtype=bool).reshape(-1, 3))
         self._parts.append((kind, np.array([*frames, *range(start, self.size)]), options))
+        return len(self._parts) - 1
 
     def add_mass(self, frame: int, mass: float, inertia: np.ndarray, payload: float = 0.0) -> None:
         """Give the rigid part at a frame mass [kg], inertia along the directors [kg m2] (3, 3) and a payload [kg]."""
         from softgym_envs.mechanics.elements.rigid import RigidBody
 
         self._parts.append((RigidBody, np.array(frame), {"mass": mass, "inertia": inertia, "payload": payload}))
+
+    def finish(self, change: Callable[[MechanicalModel], None]) -> None:
+        """Have the finished model changed in `build`, for parts that add more to it than elements."""
+        self._finishes.append(change)
 
     def build(self) -> MechanicalModel:
         """Return the model, with its blocks in the order in which they were added.
@@ -233,21 +174,9 @@ class ModelBuilder:
             gravity=self._gravity,
             solver=self._solver,
         )
-        if self._rods:
-            self._add_rods(model)
+        for finish in self._finishes:
+            finish(model)
         from softgym_envs.mechanics.locking import warn_of_locking
 
         warn_of_locking(model)
         return model
-
-    def _add_rods(self, model: MechanicalModel) -> None:
-        from softgym_envs.mechanics.elements.beams import Beam
-        from softgym_envs.mechanics.rods import Rod
-        from softgym_envs.mechanics.skins import tube_skin
-
-        for part, places, outline in self._rods:
-            beam = model.blocks[part]
-            assert isinstance(beam, Beam)
-            model.rods.append(Rod(beam, places))
-            if outline is not None:
-                model.skins.append(tube_skin(beam, model.nodes, outline))

@@ -1,17 +1,17 @@
-"""Named dead loads on points, edges and rods."""
+"""Named dead loads on points, edges and rows."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TypeAlias
 
 import numpy as np
 
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.solids import Fixed
 
-if TYPE_CHECKING:
-    from softgym_envs.mechanics.rods import Rod
+Shares: TypeAlias = tuple[np.ndarray, np.ndarray]
+"""Rows, shape (k,), and the share of a load on each of them, shape (k,)."""
 
 
 @dataclass(frozen=True)
@@ -33,24 +33,22 @@ class Load:
         np.add.at(loads, self.rows, sign * self.shares[:, None] * self.force)
 
 
-def spread(name: str, on: EmbeddedPoints | Rod | Fixed, nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return rows and shares of a load: equal on points, in proportion to the length along an edge or a rod.
+def spread(name: str, on: EmbeddedPoints | Shares | Fixed, nodes: np.ndarray) -> Shares:
+    """Return rows and shares of a load: equal on points, in proportion to the length along an edge.
 
     Args:
         name: of the load, for messages.
-        on: points, a rod, or the nodes of a straight edge as for ``fixed`` in `MechanicalModel.from_mesh`.
+        on: points, rows with their shares, or the nodes of a straight edge as for ``fixed`` in
+            `MechanicalModel.from_mesh`.
         nodes: rest rows [m], shape (n, 3).
 
     Raises:
         ValueError: if no node is chosen, or the chosen ones do not lie on a straight line.
     """
-    from softgym_envs.mechanics.rods import Rod
-
     if isinstance(on, EmbeddedPoints):
         return on.node_ids.ravel(), on.weights.ravel() / len(on.node_ids)
-    if isinstance(on, Rod):
-        shares = np.array([0.5, 0.5]) if on.beam.order == 1 else np.array([1.0, 4.0, 1.0]) / 6.0
-        return on.beam.rows.ravel(), (on.beam.lengths[:, None] * shares / on.beam.lengths.sum()).ravel()
+    if isinstance(on, tuple) and isinstance(on[0], np.ndarray):
+        return on
     chosen = np.asarray(on(nodes) if callable(on) else on)
     rows = np.flatnonzero(chosen) if chosen.dtype == bool else chosen.astype(np.int64)
     if not len(rows):

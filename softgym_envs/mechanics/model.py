@@ -24,7 +24,7 @@ from softgym_envs.mechanics.elements.quadratic import QuadraticTetrahedra, quadr
 from softgym_envs.mechanics.elements.tetrahedra import SolidBlock, check_nodes
 from softgym_envs.mechanics.frames import Frames
 from softgym_envs.mechanics.kinematics import Kinematics
-from softgym_envs.mechanics.loads import Load, spread
+from softgym_envs.mechanics.loads import Load, Shares, spread
 from softgym_envs.mechanics.materials import Material
 from softgym_envs.mechanics.mesh_checks import check_held
 from softgym_envs.mechanics.solids import (
@@ -46,7 +46,6 @@ from softgym_envs.quantities import check_quantity, finite_number, numbers
 if TYPE_CHECKING:
     from softgym_envs.mechanics.contact.contact import Contact, ContactSettings
     from softgym_envs.mechanics.contact.obstacles import MeshObstacle, Obstacle
-    from softgym_envs.mechanics.rods import Rod
     from softgym_envs.mechanics.skins import Skin
     from softgym_envs.mechanics.warping import Warping
 
@@ -79,7 +78,6 @@ class MechanicalModel:
             ``"s"`` sensors (measured, never loaded), ``"b"`` bonds (held at zero, not part of the condensed model).
         nodal_loads: dead loads on the rows besides gravity [N], shape (n, 3); change them in place.
         skins: surfaces of beams and rigid parts, for pictures and contact.
-        rods: beams along a line, from `ModelBuilder.add_rod`.
         named_loads: loads from `add_load` by name.
         contact: what the surface of the body touches, or None; see `set_contact`.
         gravity: acceleration [m/s2], shape (3,); see `set_gravity`.
@@ -123,7 +121,6 @@ class MechanicalModel:
         self.floating, self._is_held, self.solver = floating, floating, solver
         self.constraints: dict[str, list[Constraint]] = {"a": [], "e": [], "c": [], "s": [], "b": []}
         self.skins: list[Skin] = []
-        self.rods: list[Rod] = []
         self.named_loads: dict[str, Load] = {}
         self.contact: Contact | None = None
         self.nodal_loads = np.zeros_like(self.nodes)
@@ -329,12 +326,6 @@ class MechanicalModel:
         self.add("a", cable := Cable(name, embedding, origin, unilateral=unilateral))
         return cable
 
-    def add_tendon(self, name: str, places: ArrayLike, offsets: ArrayLike, *, rod: int = 0, **options: Any) -> Cable:
-        """Add a tendon along the rod of a number among `rods`; the other arguments are those of `Rod.tendon`."""
-        tendon = self.rods[rod].tendon(name, places, offsets, self.nodes, **options)
-        self.add("a", tendon)
-        return tendon
-
     def add_cavity(
         self,
         name: str,
@@ -417,7 +408,7 @@ class MechanicalModel:
     ) -> Point:
         """Add an effector at a material point [m] (3,) of a solid, or averaged over a radius [m] (see `embed`).
 
-        Or at a point that is embedded already, as one of a rod (`Rod.points`).
+        Or at a point that is embedded already, as one of a rod.
         """
         if not isinstance(point, EmbeddedPoints):
             point = self.embed(point, hint, block=block, name=f"effector '{name}'", radius=radius)
@@ -485,11 +476,11 @@ class MechanicalModel:
             for block in self.blocks:
                 self._gravity_forces += block.nodal_masses(len(self.nodes))[:, None] * acceleration
 
-    def add_load(self, name: str, force: ArrayLike, on: EmbeddedPoints | Rod | Fixed) -> None:
+    def add_load(self, name: str, force: ArrayLike, on: EmbeddedPoints | Shares | Fixed) -> None:
         """Add a force [N] (3,) that keeps its direction, or change the one of the same name.
 
-        It acts on embedded points in equal parts, evenly along a rod, or on the nodes of a straight edge, given as for
-        ``fixed``, in proportion to its length.
+        It acts on embedded points in equal parts, on the nodes of a straight edge, given as for ``fixed``, in
+        proportion to its length, or on rows by their shares.
 
         Raises:
             ValueError: if the force is not three finite numbers, or acts on no node or on no straight edge.

@@ -9,9 +9,10 @@ from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.control import InverseQP, PICorrection
 from softgym_envs.errors import ConvergenceError
+from softgym_envs.extensions.beams import Section, add_rod
 from softgym_envs.extensions.deployment import EmbeddedLoop
 from softgym_envs.extensions.grasping import ContactQP
-from softgym_envs.mechanics import ModelBuilder, Section, Statics
+from softgym_envs.mechanics import ModelBuilder, Statics
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.solvers.complementarity import solve_complementarity
 
@@ -487,11 +488,11 @@ def stretching_rod():
     discs = np.linspace(0.0, 0.2, 11)
     builder = ModelBuilder()
     path = [[0, 0, 0], [0, 0, 0.2]]
-    builder.add_rod(path, section=Section.circle(0.5e-3), elements=discs, young_modulus=6e10, density=6450)
+    rod = add_rod(builder, path, section=Section.circle(0.5e-3), elements=discs, young_modulus=6e10, density=6450)
     model = builder.build()
     for name, side, compliance in (("left", -1.0, 1e-3), ("right", 1.0, 2e-4)):
-        model.add_tendon(name, discs[1:], [side * 0.0045, 0.0], compliance=compliance)
-    model.add_effector("tip", model.rods[0].points(0.2, (0.0, 0.0), model.nodes))
+        rod.add_tendon(model, name, discs[1:], [side * 0.0045, 0.0], compliance=compliance)
+    model.add_effector("tip", rod.points(0.2, (0.0, 0.0), model.nodes))
     return Statics(model)
 
 

@@ -7,11 +7,11 @@ import pickle
 import numpy as np
 import pytest
 
+from softgym_envs.extensions.beams.beam import Beam, Section
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.bond import Bond
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
-from softgym_envs.mechanics.elements.beams import Beam, Section
 from softgym_envs.mechanics.elements.quadratic import add_midside_nodes
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solids import SOLIDS
@@ -88,7 +88,7 @@ def composite(box, solver="auto"):
     plate = body.add_frame([0.04, 0.005, 0.005])
     body.carry(plate, first + np.flatnonzero(np.isclose(nodes[:, 0], 0.04)))
     frames = [plate, *(body.add_frame([0.04 + s, 0.005, 0.005]) for s in (0.01, 0.02, 0.03, 0.04))]
-    body.add_beam(frames, section=Section.circle(0.002), young_modulus=1e7, order=2)
+    body.add_element(Beam, frames, section=Section.circle(0.002), young_modulus=1e7, order=2)
     second = body.add_solid(
         nodes + [0.08, 0.0, 0.0],
         tetrahedra,

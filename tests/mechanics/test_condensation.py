@@ -13,13 +13,13 @@ import pickle
 import numpy as np
 import pytest
 
+from softgym_envs.extensions.beams.chamber import Chamber
+from softgym_envs.extensions.beams.servo import Servo
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.constraints.bond import Bond
 from softgym_envs.mechanics.constraints.cable import Cable
 from softgym_envs.mechanics.constraints.cavity import Cavity
-from softgym_envs.mechanics.constraints.chamber import Chamber
 from softgym_envs.mechanics.constraints.point import Point
-from softgym_envs.mechanics.constraints.servo import Servo
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.units import effort_unit

@@ -10,19 +10,20 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from softgym_envs.extensions.beams.beam import Beam, Section
+from softgym_envs.extensions.beams.chamber import Chamber
+from softgym_envs.extensions.beams.pose import Pose
+from softgym_envs.extensions.beams.rods import add_rod
+from softgym_envs.extensions.beams.servo import Servo
 from softgym_envs.mechanics import ModelBuilder, Statics, constraints
 from softgym_envs.mechanics.constraints.averaging import averaged_points
 from softgym_envs.mechanics.constraints.bond import Bond
 from softgym_envs.mechanics.constraints.cable import Cable
 from softgym_envs.mechanics.constraints.cavity import Cavity, SealedAir, enclosed_volume
-from softgym_envs.mechanics.constraints.chamber import Chamber
 from softgym_envs.mechanics.constraints.constraint import Constraint
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
-from softgym_envs.mechanics.constraints.pose import Pose
-from softgym_envs.mechanics.constraints.servo import Servo
 from softgym_envs.mechanics.constraints.slide import Slide
-from softgym_envs.mechanics.elements.beams import Beam, Section
 from softgym_envs.mechanics.elements.quadratic import add_midside_nodes, quadratic_triangles, split_triangles
 from softgym_envs.mechanics.frames import frame_rows
 
@@ -234,9 +235,11 @@ def test_a_slide_pushes_a_rod_by_its_stiffness_along_and_across():
     # Steel wire: E A / L along it; across it 3 E I / L^3, with shear.
     length, radius, modulus = 0.2, 2e-3, 2e11
     builder = ModelBuilder()
-    builder.add_rod([[0, 0, 0], [0, 0, length]], section=Section.circle(radius), elements=8, young_modulus=modulus)
+    rod = add_rod(
+        builder, [[0, 0, 0], [0, 0, length]], section=Section.circle(radius), elements=8, young_modulus=modulus
+    )
     model = builder.build()
-    section, rod = Section.circle(radius), model.rods[0]
+    section = Section.circle(radius)
     end = rod.points(length, (0.0, 0.0), model.nodes)
     model.add("a", Slide("along", end, [0, 0, 5.0]))
     model.add("a", Slide("across", end, [1, 0, 0]))

@@ -7,13 +7,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from softgym_envs.errors import ConvergenceError
+from softgym_envs.extensions.beams.beam import Beam, Section
+from softgym_envs.extensions.beams.chamber import Chamber
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.bond import Bond
 from softgym_envs.mechanics.constraints.cavity import Cavity
-from softgym_envs.mechanics.constraints.chamber import Chamber
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
-from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.elements.quadratic import quadratic_triangles
 from softgym_envs.mechanics.frames import rotation_of
 from softgym_envs.mechanics.model import MechanicalModel
@@ -472,7 +472,7 @@ def test_a_chamber_bends_its_beam_with_a_moment(box):
         body.add_frame([s, 0.0, 0.0], fixed=k == 0, fixed_spin=k == 0)
         for k, s in enumerate(np.linspace(0.0, 0.1, count))
     ]
-    body.add_beam(frames, section=section, young_modulus=young, poisson_ratio=0.3)
+    body.add_element(Beam, frames, section=section, young_modulus=young, poisson_ratio=0.3)
     model = body.build()
     beam = model.blocks[0]
     model.add("a", Chamber("chamber", [beam.line(range(4), (offset, 0.0), model.nodes)], area))

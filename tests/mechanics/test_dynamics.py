@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from softgym_envs.errors import ConvergenceError
+from softgym_envs.extensions.beams.servo import Servo
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
-from softgym_envs.mechanics.constraints.servo import Servo
 from softgym_envs.mechanics.elements.rigid import sphere_inertia
 from softgym_envs.mechanics.solvers.dynamics import SCHEMES, Dynamics
 from tests.verification import dynamics as cases

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from softgym_envs.extensions.beams.beam import Beam, Section
+from softgym_envs.extensions.beams.chamber import Chamber
+from softgym_envs.extensions.beams.servo import Servo
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.bond import Bond
 from softgym_envs.mechanics.constraints.cable import Cable
 from softgym_envs.mechanics.constraints.cavity import Cavity
-from softgym_envs.mechanics.constraints.chamber import Chamber
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
-from softgym_envs.mechanics.constraints.servo import Servo
-from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.frames import Frames, frame_rows, rotation_of, rotation_vector_matrix
 from softgym_envs.mechanics.materials import MATERIALS
 from softgym_envs.mechanics.solids import SOLIDS
@@ -48,7 +48,7 @@ def capped(box):
         # A second rigid part next to the block, held only by three bonds, and a beam from it into space.
         part = body.add_frame([0.03, 0.01, 0.015], np.eye(3)[:, [1, 2, 0]])
         chain = [part, *(body.add_frame([0.03, 0.01 + s, 0.015], np.eye(3)[:, [1, 2, 0]]) for s in (0.02, 0.04))]
-        body.add_beam(chain, section=Section.circle(0.003), young_modulus=1e6, order=2)
+        body.add_element(Beam, chain, section=Section.circle(0.003), young_modulus=1e6, order=2)
         model = body.build()
         points = np.array([[0.02, 0.005, 0.02], [0.02, 0.016, 0.02], [0.02, 0.01, 0.008]])
         for k, point in enumerate(points):

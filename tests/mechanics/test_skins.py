@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from softgym_envs.mechanics.skins import bridge_skin
+from softgym_envs.extensions.beams.skins import bridge_skin
 
 AXES = Rotation.from_euler("z", 0.4).as_matrix()
 LENGTH, HALF = 0.03, (0.002, 0.005)

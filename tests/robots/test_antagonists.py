@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from softgym_envs import DesignSpace, DesignVariable
-from softgym_envs.mechanics import ModelBuilder, Section, Statics
+from softgym_envs.extensions.beams import Section, add_rod
+from softgym_envs.mechanics import ModelBuilder, Statics
 from softgym_envs.robots import Actuator, Robot
 
 
@@ -27,13 +28,15 @@ class Stalk(Robot):
         discs = np.linspace(0.0, 0.2, 11)
         builder = ModelBuilder(gravity=self.gravity)
         section = Section.circle(design["radius"])
-        builder.add_rod([[0, 0, 0], [0, 0, 0.2]], section=section, elements=discs, young_modulus=6e10, density=6450)
+        rod = add_rod(
+            builder, [[0, 0, 0], [0, 0, 0.2]], section=section, elements=discs, young_modulus=6e10, density=6450
+        )
         model = builder.build()
         for k, actuator in enumerate(self.actuators):
             angle = 0.5 * np.pi * k
             offset = 0.006 * np.array([np.cos(angle), np.sin(angle)])
-            model.add_tendon(actuator.name, discs[1:], offset, compliance=1e-4)
-        model.add_effector("tip", model.rods[0].points(0.2, (0.0, 0.0), model.nodes))
+            rod.add_tendon(model, actuator.name, discs[1:], offset, compliance=1e-4)
+        model.add_effector("tip", rod.points(0.2, (0.0, 0.0), model.nodes))
         return model
 
 

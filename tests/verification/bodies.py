@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 
+from softgym_envs.extensions.beams.beam import Beam, Section
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.cavity import Cavity
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
-from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.elements.quadratic import add_midside_nodes, quadratic_triangles, split_triangles
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solids import SOLIDS
@@ -103,7 +103,7 @@ def clamped_beam(
     body = ModelBuilder()
     places = np.linspace(0.0, 1.0, order * elements + 1)
     frames = [body.add_frame(*curve(t), fixed=t == 0.0, fixed_spin=t == 0.0) for t in places]
-    body.add_beam(frames, section=section, order=order, **options)
+    body.add_element(Beam, frames, section=section, order=order, **options)
     model = body.build()
     model.add("e", Point("tip", EmbeddedPoints.in_frame(frames[-1], np.zeros(3), model.nodes)))
     return model

@@ -12,16 +12,16 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.errors import ConvergenceError
+from softgym_envs.extensions.beams.beam import Beam, Section
+from softgym_envs.extensions.beams.skins import box_skin, tube_skin
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.contact.contact import Contacts, ContactSettings
 from softgym_envs.mechanics.contact.obstacles import Cylinder, Plane, Sphere
-from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.elements.rigid import box_inertia
 from softgym_envs.mechanics.gmsh_process import set_options
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.skins import box_skin, tube_skin
 from softgym_envs.mechanics.solvers.complementarity import solve_complementarity
 from softgym_envs.mechanics.solvers.dynamics import Dynamics
 from softgym_envs.mechanics.solvers.statics import Statics
@@ -120,7 +120,7 @@ class Indentation:
         self.height = 1.0 + self.distance
         frame = builder.add_frame((0, 0, self.height), UP, fixed=(not half, True, False), fixed_spin=True)
         end = builder.add_frame((0, 0, self.height + 0.5), UP, fixed=True, fixed_spin=True)
-        builder.add_beam([frame, end], order=1, section=Section.circle(1e-4), young_modulus=1.0)
+        builder.add_element(Beam, [frame, end], order=1, section=Section.circle(1e-4), young_modulus=1.0)
         self.model = builder.build()
         self.model.add("a", Point("sphere", EmbeddedPoints.in_frame(frame, np.zeros(3), self.model.nodes)))
         self.model.set_contact(
@@ -340,7 +340,7 @@ def beam_on_cylinder(loads: Sequence[float] = (0.02, 0.04), elements: int = 10, 
         builder = ModelBuilder()
         places = np.linspace(0.0, length, order * elements + 1)
         frames = [builder.add_frame((x, 0, 0), fixed=x == 0.0, fixed_spin=x == 0.0) for x in places]
-        builder.add_beam(frames, section=section, order=order, young_modulus=young, poisson_ratio=0.0)
+        builder.add_element(Beam, frames, section=section, order=order, young_modulus=young, poisson_ratio=0.0)
         model = builder.build()
         outline = 0.5 * width * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
         model.skins.append(tube_skin(model.blocks[0], model.nodes, outline))  # type: ignore[arg-type]

@@ -15,11 +15,11 @@ from scipy.optimize import brentq
 from scipy.sparse import csc_matrix
 from scipy.spatial.transform import Rotation
 
+from softgym_envs.extensions.beams.beam import Beam, Section
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.bond import Bond
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
-from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.elements.rigid import box_inertia
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.dynamics import SCHEMES, Dynamics
@@ -64,7 +64,7 @@ def rod(*, clamped: bool, elements: int = 8, order: int = 2, radius: float = 0.0
         for s in np.linspace(0.0, 1.0, order * elements + 1)
     ]
     material = {"young_modulus": 1e7, "poisson_ratio": 0.3, "density": 1000.0}
-    body.add_beam(frames, section=Section.circle(radius), order=order, **material)
+    body.add_element(Beam, frames, section=Section.circle(radius), order=order, **material)
     model = body.build()
     model.add("e", Point("tip", EmbeddedPoints.in_frame(frames[-1], np.zeros(3), model.nodes)))
     return model

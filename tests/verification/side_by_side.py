@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from softgym_envs.mechanics.elements.beams import Section
+from softgym_envs.extensions.beams.beam import Section
 from softgym_envs.mechanics.materials import MATERIALS, lame_parameters
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics

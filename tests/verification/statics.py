@@ -13,9 +13,9 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.special import ellipeinc, ellipk, ellipkinc
 
+from softgym_envs.extensions.beams.beam import Section
+from softgym_envs.extensions.beams.chamber import Chamber
 from softgym_envs.mechanics.builder import ModelBuilder
-from softgym_envs.mechanics.constraints.chamber import Chamber
-from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.materials import MATERIALS
 from softgym_envs.mechanics.solids import SOLIDS
 from softgym_envs.mechanics.solvers.statics import Statics

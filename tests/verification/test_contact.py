@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
+from softgym_envs.extensions.beams.beam import Beam, Section
+from softgym_envs.extensions.beams.skins import box_skin, tube_skin
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.contact.contact import ContactSettings, ContactState
 from softgym_envs.mechanics.contact.obstacles import Cylinder, MeshObstacle, Plane, RoundedPrism, Sphere
-from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.elements.rigid import box_inertia
-from softgym_envs.mechanics.skins import box_skin, tube_skin
 from softgym_envs.mechanics.solvers.dynamics import Dynamics
 from softgym_envs.mechanics.solvers.statics import Statics
 from tests.helpers import box_mesh
@@ -97,7 +97,7 @@ def carried_ball(obstacle, *, friction_above=0.0):
     assert start == 0
     frame = builder.add_frame((0.001, 0.002, 0.0126), cases.UP, fixed_spin=True)
     end = builder.add_frame((0.001, 0.002, 0.06), cases.UP, fixed=True, fixed_spin=True)
-    builder.add_beam([frame, end], order=1, section=Section.circle(6e-3), young_modulus=1e6)
+    builder.add_element(Beam, [frame, end], order=1, section=Section.circle(6e-3), young_modulus=1e6)
     model = builder.build()
     model.add("a", Point("ball", EmbeddedPoints.in_frame(frame, np.zeros(3), model.nodes)))
     model.add_effector("inside", (0.0, 0.0, -0.003))
@@ -243,7 +243,9 @@ def test_compliance_of_a_beam_whose_skin_touches(friction, tolerance):
     builder = ModelBuilder()
     places = np.linspace(0.0, 0.1, 9)
     frames = [builder.add_frame((x, 0, 0), fixed=x == 0.0, fixed_spin=x == 0.0) for x in places]
-    builder.add_beam(frames, section=Section.rectangle(8e-3, 6e-3), order=2, young_modulus=1e6, poisson_ratio=0.3)
+    builder.add_element(
+        Beam, frames, section=Section.rectangle(8e-3, 6e-3), order=2, young_modulus=1e6, poisson_ratio=0.3
+    )
     model = builder.build()
     half = (0.004, 0.006, 0.006)
     outline = 1e-3 * np.array([(-4, -3), (4, -3), (4, 3), (-4, 3)])

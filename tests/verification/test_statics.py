@@ -9,7 +9,7 @@ from scipy.integrate import solve_bvp
 from scipy.sparse import bmat
 from skfem.helpers import ddot, div, sym_grad
 
-from softgym_envs.mechanics.elements.beams import Section
+from softgym_envs.extensions.beams.beam import Section
 from tests.verification import statics as validation
 from tests.verification.rows import with_orders
 

@@ -9,15 +9,15 @@ import numpy as np
 
 from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
+from softgym_envs.extensions.beams.beam import Beam, Section
+from softgym_envs.extensions.beams.chamber import Chamber
+from softgym_envs.extensions.beams.skins import box_skin, tube_skin
 from softgym_envs.mechanics.builder import ModelBuilder
-from softgym_envs.mechanics.constraints.chamber import Chamber
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.contact.contact import ContactSettings
 from softgym_envs.mechanics.contact.obstacles import Plane
-from softgym_envs.mechanics.elements.beams import Beam, Section
 from softgym_envs.mechanics.elements.rigid import box_inertia
-from softgym_envs.mechanics.skins import box_skin, tube_skin
 from softgym_envs.mechanics.solvers.dynamics import Dynamics
 from softgym_envs.mechanics.solvers.schemes import ImplicitEuler
 
@@ -42,7 +42,7 @@ def walker(obstacles, *, elements=2, length=0.05, modulus=6e5, clearance=4e-4, r
         for k in range(2 * elements + 1):
             place = centre + rotation @ (root - [0.0, 0.0, length * k / (2 * elements)])
             rows.append(builder.add_frame(place, rotation @ DOWN, on=trunk if k == 0 else None))
-        builder.add_beam(rows, section=section, young_modulus=modulus, poisson_ratio=0.45, density=1070.0)
+        builder.add_element(Beam, rows, section=section, young_modulus=modulus, poisson_ratio=0.45, density=1070.0)
     model = builder.build()
     angle = 2.0 * np.pi * np.arange(8) / 8
     outline = RADIUS * np.column_stack([np.cos(angle), np.sin(angle)])

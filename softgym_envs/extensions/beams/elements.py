@@ -13,11 +13,12 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from softgym_envs.extensions.beams.beam import warp_lines
+from softgym_envs.extensions.beams.skins import BRIDGE_SECTIONS, swept_triangles
 from softgym_envs.mechanics.compilation import njit
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
-from softgym_envs.mechanics.elements.beams import warp_lines
 from softgym_envs.mechanics.elements.block import ElementBlock, StrainRates, lower_pairs
-from softgym_envs.mechanics.skins import BRIDGE_SECTIONS, Skin, swept_triangles
+from softgym_envs.mechanics.skins import Skin
 
 ROWS = 8
 """Rows of both ports: the middle and the three axes of the near one, and of the far one."""

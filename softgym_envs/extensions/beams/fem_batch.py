@@ -11,12 +11,12 @@ from softgym_envs.backends.batch import BatchBackend, BatchState, condensed_grad
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
+from softgym_envs.extensions.beams.beam import are_folded
 from softgym_envs.extensions.beams.solver.batch import BeamBatch, BeamStates
 from softgym_envs.extensions.beams.solver.motion import BeamMotion, anchors_of, memory_of
 from softgym_envs.extensions.beams.solver.points import ContactPoints
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.contact.contact import ContactMemory
-from softgym_envs.mechanics.elements.beams import are_folded
 from softgym_envs.mechanics.solvers.equilibrium import RowLayout
 from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.domain import FOLDED

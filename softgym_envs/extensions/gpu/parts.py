@@ -19,9 +19,9 @@ from softgym_envs.extensions.beams.parts.energy import LegFunction
 from softgym_envs.extensions.beams.parts.leg import LegScale
 from softgym_envs.extensions.beams.parts.trust import SOFTEST
 from softgym_envs.extensions.beams.parts.weights import of_learned_parts
+from softgym_envs.extensions.beams.servo import Servo
 from softgym_envs.extensions.gpu.surrogates import Bodies
 from softgym_envs.mechanics.constraints.point import Point
-from softgym_envs.mechanics.constraints.servo import Servo
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import Robot

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.designs import DesignSpace, DesignVariable
+from softgym_envs.extensions.beams.beam import Section
+from softgym_envs.extensions.beams.rods import add_rod
 from softgym_envs.mechanics.builder import ModelBuilder
-from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.actuator import Actuator
 from softgym_envs.robots.base import Robot
@@ -75,7 +76,8 @@ class TendonCone(Robot):
         long, short = self.elements
         ends = np.concatenate([np.linspace(0.0, LONG, long + 1), LONG + np.linspace(0.0, SHORT, short + 1)[1:]])
         builder = ModelBuilder(gravity=self.gravity)
-        builder.add_rod(
+        rod = add_rod(
+            builder,
             [[0.0, 0.0, 0.0], [0.0, 0.0, -LONG - SHORT]],
             section=lambda s: Section.circle(float(np.interp(s, [0.0, LONG, LONG + SHORT], RADII))),
             elements=ends,
@@ -89,7 +91,7 @@ class TendonCone(Robot):
         for actuator, angle in zip(self.actuators, np.deg2rad(ANGLES), strict=True):
             x, y = np.sin(angle), np.cos(angle)
             distance = (OFFSET - TAPER * places)[:, None]
-            model.add_tendon(actuator.name, places, distance * [x, -y], pull_point=[OFFSET * x, OFFSET * y, 0.0])
+            rod.add_tendon(model, actuator.name, places, distance * [x, -y], pull_point=[OFFSET * x, OFFSET * y, 0.0])
         for name, (place, (along, x, y)) in MARKERS.items():
-            model.add_effector(name, model.rods[0].points(place, (along, x, y), model.nodes))
+            model.add_effector(name, rod.points(place, (along, x, y), model.nodes))
         return model

@@ -16,8 +16,9 @@ import numpy as np
 
 from softgym_envs.arguments import choice
 from softgym_envs.designs import DesignSpace, DesignVariable
+from softgym_envs.extensions.beams.beam import Section
+from softgym_envs.extensions.beams.rods import add_rod
 from softgym_envs.mechanics.builder import ModelBuilder
-from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.actuator import Actuator
 from softgym_envs.robots.base import Robot
@@ -95,7 +96,8 @@ class TendonRod(Robot):
         ]
         frames = np.concatenate([[0.0], *discs])
         builder = ModelBuilder(gravity=self.gravity)
-        builder.add_rod(
+        rod = add_rod(
+            builder,
             [[0.0, 0.0, 0.0], [0.0, 0.0, starts[-1]]],
             section=Section.circle(RADIUS),
             elements=frames[::2],  # the discs between are the middles of elements
@@ -110,8 +112,8 @@ class TendonRod(Robot):
             through = np.concatenate(discs[: segment + 1])
             for angle in angles + segment * design["twist"]:
                 around = design["offset"] * np.array([np.cos(angle), np.sin(angle)])
-                model.add_tendon(next(actuators).name, through, around)
-        model.add_effector("tip", model.rods[0].points(starts[-1], (MARKER, 0.0, 0.0), model.nodes))
+                rod.add_tendon(model, next(actuators).name, through, around)
+        model.add_effector("tip", rod.points(starts[-1], (MARKER, 0.0, 0.0), model.nodes))
         return model
 
     def displacements(self, fractions: np.ndarray) -> np.ndarray:

@@ -10,10 +10,10 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from softgym_envs.designs import DesignSpace, DesignVariable
+from softgym_envs.extensions.beams.pose import Pose
 from softgym_envs.extensions.deployment.cad import write_drawing
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.cavity import Cavity
-from softgym_envs.mechanics.constraints.pose import Pose
 from softgym_envs.mechanics.elements.quadratic import add_midside_nodes, quadratic_triangles
 from softgym_envs.mechanics.elements.tetrahedra import Tetrahedra
 from softgym_envs.mechanics.model import MechanicalModel

@@ -9,6 +9,7 @@ import numpy as np
 
 from softgym_envs.designs import DesignSpace, DesignVariable
 from softgym_envs.errors import InfeasibleDesign, unknown_name
+from softgym_envs.extensions.beams.skins import box_skin, bridge_skin
 from softgym_envs.extensions.modules.base import Module
 from softgym_envs.extensions.modules.closed_superelement import ClosedSuperelement, PortCavity, add_superelement
 from softgym_envs.extensions.modules.learned import learned_module
@@ -20,7 +21,6 @@ from softgym_envs.mechanics.constraints.cavity import Cavity
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.skins import box_skin, bridge_skin
 from softgym_envs.robots.base import Actuator, Robot
 from softgym_envs.robots.capabilities import Learning
 

@@ -9,6 +9,7 @@ import pytest
 
 from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
+from softgym_envs.extensions.beams.beam import Beam, Section
 from softgym_envs.extensions.beams.solver.batch import BeamBatch, BeamStates
 from softgym_envs.extensions.beams.solver.contact import FEW
 from softgym_envs.extensions.beams.solver.equations import Step, assemble, point_strains
@@ -17,7 +18,6 @@ from softgym_envs.extensions.beams.solver.motion import anchors_of
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.contact.contact import ContactSettings
 from softgym_envs.mechanics.contact.obstacles import Cylinder, MeshObstacle, Plane, RoundedPrism, Sphere
-from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.solvers.dynamics import Dynamics
 from softgym_envs.mechanics.solvers.statics import Statics
 from tests.verification.walkers import H, compared_walk, dynamics, ground, mover, remaining, trot, walker
@@ -257,5 +257,5 @@ def test_bodies_that_need_the_general_solver_say_why():
     builder.add_mass(frames[0], 1.0, np.eye(3))
     assert Dynamics(builder.build(), step=H).not_compiled == "it has no beams"
     options = {"young_modulus": 1e6, "poisson_ratio": 0.3, "density": 1e3, "order": 1}
-    builder.add_beam(frames[:2], section=Section.circle(0.001), **options)
+    builder.add_element(Beam, frames[:2], section=Section.circle(0.001), **options)
     assert Dynamics(builder.build(), step=H).not_compiled == "a beam has linear elements"

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from softgym_envs.backends.fem import FEMBackend
+from softgym_envs.extensions.beams.beam import Beam, Section
 from softgym_envs.extensions.beams.robots.stiff_flop import StiffFlop
 from softgym_envs.extensions.beams.robots.tetrapod import Tetrapod
 from softgym_envs.extensions.beams.solver import block_cholesky, block_elimination
@@ -18,7 +19,6 @@ from softgym_envs.extensions.beams.solver.motion import BeamMotion
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
-from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.solvers.dynamics import Dynamics
 from softgym_envs.mechanics.solvers.schemes import ImplicitEuler
 from softgym_envs.mechanics.solvers.statics import Statics
@@ -381,7 +381,7 @@ def test_a_free_beam_keeps_the_energy_that_the_general_solver_keeps():
     """A beam without supports spins and bends; implicit Euler dissipates, and both by the same amount."""
     body = ModelBuilder(floating=True)
     frames = [body.add_frame([0.05 * k, 0.0, 0.0]) for k in range(5)]
-    body.add_beam(frames, section=Section.circle(5e-3), young_modulus=1e7)
+    body.add_element(Beam, frames, section=Section.circle(5e-3), young_modulus=1e7)
     model = body.build()
     model.add("e", Point("tip", EmbeddedPoints.in_frame(frames[-1], np.array([0.0, 0.01, 0.0]), model.nodes)))
     solvers = [Dynamics(model, step=1e-3, tolerance=1e-12, compiled=compiled) for compiled in (True, False)]
@@ -418,7 +418,7 @@ def test_what_the_compiled_steps_cannot_do_goes_to_the_general_solver():
     # Beams of order 1 and bodies that can touch something are not compiled, either.
     body = ModelBuilder()
     frames = [body.add_frame([0.05 * k, 0.0, 0.0], fixed=not k, fixed_spin=not k) for k in range(3)]
-    body.add_beam(frames, section=Section.circle(5e-3), young_modulus=1e7, order=1)
+    body.add_element(Beam, frames, section=Section.circle(5e-3), young_modulus=1e7, order=1)
     assert not is_beam_body(body.build())
     assert Dynamics(body.build(), step=H).advance_compiled(np.zeros((1, 0))) == (0, None)
     assert is_beam_body(model)

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.errors import ConvergenceError, DesignError
+from softgym_envs.extensions.beams.beam import Beam
 from softgym_envs.extensions.beams.robots.tetrapod import CENTRE_MASS, MESHES, printed_leg
-from softgym_envs.mechanics.elements.beams import Beam
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.surrogate.domain import distrust_text
 from tests.verification import robot_dynamics as cases

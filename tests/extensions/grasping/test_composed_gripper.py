@@ -16,6 +16,7 @@ from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.backends.surrogate import SurrogateBackend
 from softgym_envs.control import InverseQP
 from softgym_envs.errors import WeightsError
+from softgym_envs.extensions.beams.pose import Pose
 from softgym_envs.extensions.deployment.surrogate_c import export_c
 from softgym_envs.extensions.fitting import within
 from softgym_envs.extensions.fitting.cli import calibrate_trust
@@ -35,7 +36,6 @@ from softgym_envs.extensions.grasping.robots.composed_gripper import ARRANGEMENT
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
-from softgym_envs.mechanics.constraints.pose import Pose
 from softgym_envs.mechanics.frames import rotation_of
 from softgym_envs.mechanics.solvers.learned_errors import possible_errors
 from softgym_envs.mechanics.solvers.statics import Statics

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from softgym_envs import make_robot
-from softgym_envs.mechanics.constraints.pose import Pose
+from softgym_envs.extensions.beams.pose import Pose
 from softgym_envs.mechanics.frames import frame_rows, rotation_of
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.soft_finger import SoftFinger

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
+from softgym_envs.extensions.beams.pose import Pose
 from softgym_envs.extensions.modules.closed_superelement import PortCavity, add_superelement
 from softgym_envs.extensions.modules.energy import CavityVolume, ModuleEnergy, terms, volume_terms
 from softgym_envs.extensions.modules.superelement import QuadraticEnergy, point_masses
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
-from softgym_envs.mechanics.constraints.pose import Pose
 from softgym_envs.mechanics.solvers.learned_errors import possible_errors
 from softgym_envs.mechanics.solvers.statics import Statics
 

@@ -7,6 +7,7 @@ import pytest
 
 from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
+from softgym_envs.extensions.beams.beam import Beam
 from softgym_envs.extensions.walkers.robots.crawler import (
     CHAMBER_HEIGHT,
     CHAMBER_WIDTH,
@@ -15,7 +16,6 @@ from softgym_envs.extensions.walkers.robots.crawler import (
     layered,
     neutral_height,
 )
-from softgym_envs.mechanics.elements.beams import Beam
 from tests.extensions.walkers.driving import bodies_in_motion
 
 

@@ -7,12 +7,12 @@ import math
 import numpy as np
 import pytest
 
+from softgym_envs.extensions.beams.beam import Beam, Section
+from softgym_envs.extensions.beams.chamber import Chamber
 from softgym_envs.extensions.beams.rollout import roll_out
 from softgym_envs.extensions.beams.solver.design import Neighbours
 from softgym_envs.extensions.walkers.fluid import slender_drag
 from softgym_envs.mechanics.builder import ModelBuilder
-from softgym_envs.mechanics.constraints.chamber import Chamber
-from softgym_envs.mechanics.elements.beams import Beam, Section
 from softgym_envs.mechanics.elements.block import StrainRates
 from softgym_envs.mechanics.solvers.dynamics import Dynamics
 
@@ -29,8 +29,14 @@ def rod(direction, drag, *, modulus=1e6, gravity=(0.0, 0.0, 0.0), chambers=False
     turn = np.column_stack([axis, across, np.cross(axis, across)])
     places = np.linspace(0.0, LENGTH, 2 * elements + 1)[:, None] * axis
     frames = [builder.add_frame(place, turn) for place in places]
-    builder.add_beam(
-        frames, section=Section.circle(RADIUS), young_modulus=modulus, poisson_ratio=0.45, density=1200.0, drag=drag
+    builder.add_element(
+        Beam,
+        frames,
+        section=Section.circle(RADIUS),
+        young_modulus=modulus,
+        poisson_ratio=0.45,
+        density=1200.0,
+        drag=drag,
     )
     model = builder.build()
     beam = model.blocks[0]
@@ -98,7 +104,7 @@ def test_an_undulating_filament_swims_as_gray_and_hancock_found():
         turn = np.array([[c, -d, 0.0], [d, c, 0.0], [0.0, 0.0, 1.0]])
         frames.append(builder.add_frame((x, size * math.sin(number * x), 0.0), turn))
     options = {"young_modulus": 1e6, "poisson_ratio": 0.45, "density": 1e3, "drag": (along, across)}
-    builder.add_beam(frames, section=Section.circle(RADIUS), **options)
+    builder.add_element(Beam, frames, section=Section.circle(RADIUS), **options)
     model = builder.build()
     beam, rows = model.blocks[0], np.array(frames)
     assert isinstance(beam, Beam)

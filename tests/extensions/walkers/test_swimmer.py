@@ -7,7 +7,7 @@ import pytest
 
 from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend, _drifts
-from softgym_envs.mechanics.constraints.servo import Servo
+from softgym_envs.extensions.beams.servo import Servo
 from tests.extensions.walkers.driving import bodies_in_motion
 
 

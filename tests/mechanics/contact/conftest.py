@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from softgym_envs.extensions.beams.skins import box_skin
 from softgym_envs.mechanics.builder import ModelBuilder
-from softgym_envs.mechanics.skins import box_skin
 from tests.helpers import box_mesh
 
 

@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.designs import DesignSpace, DesignVariable
+from softgym_envs.extensions.beams.beam import Beam, Section
+from softgym_envs.extensions.beams.chamber import Chamber
+from softgym_envs.extensions.beams.skins import tube_skin
 from softgym_envs.mechanics.builder import ModelBuilder
-from softgym_envs.mechanics.constraints.chamber import Chamber
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
-from softgym_envs.mechanics.elements.beams import Beam, Section
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.skins import tube_skin
 from softgym_envs.robots.base import Actuator, Robot
 from softgym_envs.robots.mesh_tiers import choose_mesh
 
@@ -143,8 +143,8 @@ class StiffFlop(Robot):
             for soft_modulus in (design["base_modulus"], design["tip_modulus"])
             for modulus in [*[soft_modulus] * self.elements, STIFF_MODULUS]
         ]
-        assembly.add_beam(
-            frames, section=section, young_modulus=moduli, poisson_ratio=design["poisson_ratio"], density=1070.0
+        assembly.add_element(
+            Beam, frames, section=section, young_modulus=moduli, poisson_ratio=design["poisson_ratio"], density=1070.0
         )
         model = assembly.build()
         beam = model.blocks[0]

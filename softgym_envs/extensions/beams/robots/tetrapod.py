@@ -14,16 +14,16 @@ import numpy as np
 from scipy.optimize import brentq
 
 from softgym_envs.designs import DesignSpace, DesignVariable
+from softgym_envs.extensions.beams.beam import Beam, Section
 from softgym_envs.extensions.beams.elements import Port, PoseParts, curve_skin
+from softgym_envs.extensions.beams.servo import Servo
+from softgym_envs.extensions.beams.skins import box_skin, tube_skin
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
-from softgym_envs.mechanics.constraints.servo import Servo
-from softgym_envs.mechanics.elements.beams import Beam, Section
 from softgym_envs.mechanics.elements.rigid import sphere_inertia
 from softgym_envs.mechanics.frames import frame_rows
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.skins import box_skin, tube_skin
 from softgym_envs.robots.base import Actuator, Robot
 from softgym_envs.robots.capabilities import Learning
 from softgym_envs.robots.mesh_tiers import choose_mesh
@@ -159,7 +159,8 @@ class Tetrapod(Robot):
             shape = _bent(root, -UP, tip, -outwards, length, along, 2 * self.elements + 1)
             mounts = {0: servo, 2 * self.elements: centre}
             frames = [assembly.add_frame(p, r, on=mounts.get(j)) for j, (p, r) in enumerate(shape)]
-            assembly.add_beam(
+            assembly.add_element(
+                Beam,
                 frames,
                 section=section,
                 young_modulus=design["young_modulus"],

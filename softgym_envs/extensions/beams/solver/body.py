@@ -7,13 +7,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse import csr_matrix
 
+from softgym_envs.extensions.beams.beam import Beam
+from softgym_envs.extensions.beams.chamber import Chamber
+from softgym_envs.extensions.beams.servo import Servo
 from softgym_envs.extensions.beams.solver.block_cholesky import SIZE, BlockPattern, analyse
 from softgym_envs.extensions.beams.solver.points import ContactPoints, contact_points, reason_against
 from softgym_envs.mechanics.assembly import MassMatrix
-from softgym_envs.mechanics.constraints.chamber import Chamber
 from softgym_envs.mechanics.constraints.point import Point
-from softgym_envs.mechanics.constraints.servo import Servo
-from softgym_envs.mechanics.elements.beams import Beam
 from softgym_envs.mechanics.elements.rigid import RigidBody
 from softgym_envs.mechanics.frames import Frames
 from softgym_envs.mechanics.model import MechanicalModel

@@ -9,11 +9,11 @@ from scipy.spatial.transform import Rotation
 
 from softgym_envs.designs import Design, DesignSpace
 from softgym_envs.errors import ConvergenceError
+from softgym_envs.extensions.beams.beam import Beam
 from softgym_envs.extensions.beams.parts.leg import VARIABLES, LegScale
 from softgym_envs.extensions.beams.robots.tetrapod import MESHES, Tetrapod
 from softgym_envs.extensions.fitting.data.sampling import pushed
 from softgym_envs.extensions.fitting.parts.held_leg import HeldLeg
-from softgym_envs.mechanics.elements.beams import Beam
 from softgym_envs.mechanics.solvers.dynamics import Dynamics
 from softgym_envs.mechanics.solvers.statics import Statics
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse import csr_matrix
 
+from softgym_envs.extensions.beams.beam import Beam, Section
 from softgym_envs.extensions.beams.robots.tetrapod import POISSON_RATIO, printed_leg
 from softgym_envs.extensions.beams.solver.block_cholesky import factorise, solve_lower, solve_upper
 from softgym_envs.extensions.beams.solver.body import beam_body
@@ -15,7 +16,6 @@ from softgym_envs.extensions.beams.solver.frames import move, orthonormalise
 from softgym_envs.mechanics.assembly import MassMatrix
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.compilation import njit
-from softgym_envs.mechanics.elements.beams import Beam, Section
 
 HOLD = 1e9
 """Stiffness of the springs that hold the tip; the leg's own is of order 1 to 1e5."""
@@ -57,7 +57,8 @@ class HeldLeg:
         rows = printed_leg(curvatures, 1.0, 2 * elements + 1)
         builder = ModelBuilder()
         frames = [builder.add_frame(row[0], row[1:].T, fixed=k == 0, fixed_spin=k == 0) for k, row in enumerate(rows)]
-        builder.add_beam(
+        builder.add_element(
+            Beam,
             frames,
             section=Section.rectangle(width, thickness),
             young_modulus=12.0 / (width * thickness**3),

@@ -17,6 +17,7 @@ from softgym_envs.backends.backend import Backend, State, check_numbers, refuse_
 from softgym_envs.backends.hybrid_path import PathHybridBackend
 from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
+from softgym_envs.extensions.beams.skins import box_skin
 from softgym_envs.extensions.grasping.chain.contact import FOLDED, STICK, STIFFNESS
 from softgym_envs.extensions.grasping.chain.equilibrium import clearances, touching
 from softgym_envs.extensions.grasping.chain.hand import (
@@ -42,7 +43,6 @@ from softgym_envs.mechanics.contact.compiled import table_of
 from softgym_envs.mechanics.contact.contact import Contacts
 from softgym_envs.mechanics.contact.obstacles import Plane, RoundedPrism
 from softgym_envs.mechanics.contact.surface import surface_of
-from softgym_envs.mechanics.skins import box_skin
 from softgym_envs.surrogate.domain import SELF_CONTACT
 
 ROLES = (("a", 3), ("e", 3))

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from softgym_envs.extensions.beams.skins import box_skin, revolved_skin
 from softgym_envs.mechanics.contact.obstacles import Obstacle, RoundedPrism, Sphere
 from softgym_envs.mechanics.elements.rigid import box_inertia, sphere_inertia
-from softgym_envs.mechanics.skins import Skin, box_skin, revolved_skin
+from softgym_envs.mechanics.skins import Skin
 
 ROUNDING = 1.0e-3
 """Radius of the edges of prisms [m]."""

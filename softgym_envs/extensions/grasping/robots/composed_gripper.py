@@ -9,11 +9,11 @@ import numpy as np
 from softgym_envs.designs import Design, DesignVariable
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.extensions.beams.elements import Port, curve_skin
+from softgym_envs.extensions.beams.pose import Pose
 from softgym_envs.extensions.grasping.held_fingers import CABLES, HeldFingers, IdleCables, SolvedFingers
 from softgym_envs.extensions.grasping.robots.contact_finger import ContactFinger
 from softgym_envs.extensions.grasping.robots.grippers import TURNED, Placements, ThreeFingerGripper
 from softgym_envs.mechanics.builder import ModelBuilder
-from softgym_envs.mechanics.constraints.pose import Pose
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.equilibrium import Equilibrium
 from softgym_envs.mechanics.solvers.statics import Statics

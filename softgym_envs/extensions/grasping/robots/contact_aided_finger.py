@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.designs import DesignSpace, DesignVariable
+from softgym_envs.extensions.beams.servo import Servo
 from softgym_envs.extensions.grasping.robots.zigzag_shape import (
     LEFT_FOOT,
     check_outline,
@@ -24,7 +25,6 @@ from softgym_envs.extensions.grasping.robots.zigzag_shape import (
 )
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.point import Point
-from softgym_envs.mechanics.constraints.servo import Servo
 from softgym_envs.mechanics.contact.obstacles import Obstacle
 from softgym_envs.mechanics.elements.quadratic import add_midside_nodes
 from softgym_envs.mechanics.model import MechanicalModel

@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
+from softgym_envs.extensions.beams.pose import Pose
 from softgym_envs.extensions.grasping.robots.grippers import STRAIGHT, FingerRobot
 from softgym_envs.mechanics.constraints.point import Point
-from softgym_envs.mechanics.constraints.pose import Pose
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Actuator
 from softgym_envs.robots.capabilities import Learning

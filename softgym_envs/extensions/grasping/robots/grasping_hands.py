@@ -14,6 +14,8 @@ import numpy as np
 
 from softgym_envs.designs import DesignSpace, DesignVariable
 from softgym_envs.errors import unknown_name
+from softgym_envs.extensions.beams.beam import Beam, Section
+from softgym_envs.extensions.beams.servo import Servo
 from softgym_envs.extensions.grasping.grasps import KINDS, GraspObject
 from softgym_envs.extensions.grasping.robots.carried_objects import CARRIED, ROUNDING, Shape
 from softgym_envs.extensions.grasping.robots.contact_aided_finger import ContactAidedFinger
@@ -21,10 +23,8 @@ from softgym_envs.extensions.grasping.robots.lifting import Lifting
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
-from softgym_envs.mechanics.constraints.servo import Servo
 from softgym_envs.mechanics.constraints.slide import Slide
 from softgym_envs.mechanics.contact.obstacles import Obstacle, Plane
-from softgym_envs.mechanics.elements.beams import Section
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Actuator, Robot
 from softgym_envs.robots.capabilities import Learning, View
@@ -229,7 +229,8 @@ def _add_table(builder: ModelBuilder) -> int:
     middle = builder.add_frame([0.0, 0.0, -0.5 * TABLE_HEIGHT], up)
     table = builder.add_frame(np.zeros(3), up, fixed=(True, True, False), fixed_spin=True)
     side = math.sqrt(TABLE_STIFFNESS * TABLE_HEIGHT / TABLE_MODULUS)
-    builder.add_beam(
+    builder.add_element(
+        Beam,
         [foot, middle, table],
         section=Section.rectangle(side, side),
         young_modulus=TABLE_MODULUS,

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.designs import DesignSpace, DesignVariable
+from softgym_envs.extensions.beams.skins import box_skin
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.bond import Bond
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.skins import box_skin
 from softgym_envs.robots.base import Actuator, Robot
 from softgym_envs.robots.capabilities import Learning
 from softgym_envs.robots.geometry.finger_shape import in_flange

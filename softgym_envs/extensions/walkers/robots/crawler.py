@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.designs import DesignSpace, DesignVariable
+from softgym_envs.extensions.beams.beam import Beam, Section
+from softgym_envs.extensions.beams.chamber import Chamber
+from softgym_envs.extensions.beams.skins import tube_skin
 from softgym_envs.extensions.walkers.robots.mobile import MobileRobot
 from softgym_envs.mechanics.builder import ModelBuilder
-from softgym_envs.mechanics.constraints.chamber import Chamber
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.contact.obstacles import Obstacle, Plane
-from softgym_envs.mechanics.elements.beams import Beam, Section
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.skins import tube_skin
 from softgym_envs.robots.actuator import Actuator
 from softgym_envs.robots.capabilities import View
 
@@ -105,8 +105,8 @@ class Crawler(MobileRobot):
         builder = ModelBuilder(gravity=self.gravity, floating=True)
         steps = np.linspace(0.0, 1.0, 2 * self.elements + 1)
         body = [builder.add_frame(middle + [place, 0.0, 0.0]) for place in half * (2.0 * steps - 1.0)]
-        material = {"young_modulus": modulus, "poisson_ratio": 0.45, "density": 1070.0}
-        builder.add_beam(body, section=layered(BODY_WIDTH, height, modulus), **material)
+        material: dict[str, Any] = {"young_modulus": modulus, "poisson_ratio": 0.45, "density": 1070.0}
+        builder.add_element(Beam, body, section=layered(BODY_WIDTH, height, modulus), **material)
         for x, y in LEGS.values():
             along = np.array([x * math.cos(angle), y * math.sin(angle), 0.0])
             directors = np.column_stack([along, np.cross([0.0, 0.0, 1.0], along), [0.0, 0.0, 1.0]])
@@ -116,7 +116,7 @@ class Crawler(MobileRobot):
                 builder.add_frame(root + place * along, directors, on=hub if k == 0 else None)
                 for k, place in enumerate(design["leg_length"] * steps)
             ]
-            builder.add_beam(frames, section=layered(width, height, modulus), **material)
+            builder.add_element(Beam, frames, section=layered(width, height, modulus), **material)
         model = builder.build()
         beams = [block for block in model.blocks if isinstance(block, Beam)]
         for actuator, beam, wide in zip(self.actuators, beams, [BODY_WIDTH, *4 * [width]], strict=True):

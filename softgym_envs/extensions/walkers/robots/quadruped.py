@@ -12,16 +12,16 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.designs import DesignSpace, DesignVariable
+from softgym_envs.extensions.beams.beam import Beam, Section
+from softgym_envs.extensions.beams.chamber import Chamber
+from softgym_envs.extensions.beams.skins import box_skin, tube_skin
 from softgym_envs.extensions.walkers.robots.mobile import MobileRobot
 from softgym_envs.mechanics.builder import ModelBuilder
-from softgym_envs.mechanics.constraints.chamber import Chamber
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.contact.obstacles import Obstacle, Plane
-from softgym_envs.mechanics.elements.beams import Beam, Section
 from softgym_envs.mechanics.elements.rigid import box_inertia
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.skins import box_skin, tube_skin
 from softgym_envs.robots.actuator import Actuator
 from softgym_envs.robots.capabilities import View
 
@@ -126,8 +126,8 @@ class Quadruped(MobileRobot):
             hip = middle + rise @ [design["stance"] * x, design["track"] * y, -0.5 * TRUNK_HEIGHT]
             places = hip + np.linspace(0.0, length, 2 * self.elements + 1)[:, None] * directors[:, 0]
             frames = [builder.add_frame(p, directors, on=trunk if k == 0 else None) for k, p in enumerate(places)]
-            builder.add_beam(
-                frames, section=section, young_modulus=design["young_modulus"], poisson_ratio=0.45, density=1070.0
+            builder.add_element(
+                Beam, frames, section=section, young_modulus=design["young_modulus"], poisson_ratio=0.45, density=1070.0
             )
         model = builder.build()
         angles = 2.0 * np.pi * np.arange(CORNERS) / CORNERS

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from softgym_envs.arguments import explained
+from softgym_envs.extensions.beams.beam import Beam, Section, lagrange
+from softgym_envs.extensions.beams.skins import tube_skin
+from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.cable import Cable
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
-from softgym_envs.mechanics.elements.beams import Beam, Section, lagrange
+from softgym_envs.mechanics.loads import Shares
+from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.quantities import check_quantity, numbers
 from softgym_envs.wording import brief
 
@@ -20,17 +25,19 @@ ENDS = {"none": (), "start": (0,), "both": (0, -1)}
 
 
 @explained
-@dataclass(frozen=True)
+@dataclass
 class Rod:
-    """A chain of beam elements whose frames are known by their place along it.
+    """A chain of beam elements whose frames are known by their place along it, from `add_rod`.
 
     Attributes:
-        beam: the elements.
+        frames: first rows of its frames.
         places: of its frames along the rod at rest [m], from zero, shape (c,).
+        beam: the elements, once the model is built.
     """
 
-    beam: Beam
+    frames: list[int]
     places: np.ndarray
+    beam: Beam = field(init=False)
 
     @property
     def length(self) -> float:
@@ -72,24 +79,30 @@ class Rod:
         weights = shape[:, :, None] * factors[:, None, :]
         return EmbeddedPoints.from_weights(ids.reshape(len(s), -1), weights.reshape(len(s), -1), nodes)
 
-    def tendon(
+    def spread(self) -> Shares:
+        """Return rows and their shares of a load that acts evenly along the rod, for `MechanicalModel.add_load`."""
+        beam = self.beam
+        shares = np.array([0.5, 0.5]) if beam.order == 1 else np.array([1.0, 4.0, 1.0]) / 6.0
+        return beam.rows.ravel(), (beam.lengths[:, None] * shares / beam.lengths.sum()).ravel()
+
+    def add_tendon(
         self,
+        model: MechanicalModel,
         name: str,
         places: ArrayLike,
         offsets: ArrayLike,
-        nodes: np.ndarray,
         *,
         pull_point: ArrayLike | None = None,
         unilateral: bool = True,
         compliance: float = 0.0,
     ) -> Cable:
-        """Return a tendon along the rod: a cable that runs straight from disc to disc.
+        """Add an actuator to a model: a tendon along the rod, a cable that runs straight from disc to disc.
 
         Args:
+            model: of which the rod is a part.
             name: identifier.
             places: of the discs that guide it, along the rod at rest from the base to the anchor [m], shape (p,).
             offsets: of the tendon along d_2 and d_3 in each disc [m], shape (2,) or (p, 2).
-            nodes: rest rows [m], shape (n, 3).
             pull_point: fixed point where the tendon leaves [m], shape (3,); default: beside the start of the rod, with
                 the offset of the first disc.
             unilateral: True for a real tendon, which cannot push.
@@ -105,9 +118,71 @@ class Rod:
         check_quantity("length", offsets, label, high=far, example="the length of the rod")
         through = np.broadcast_to(np.asarray(offsets, dtype=float), (np.size(places), 2))
         if pull_point is None:
-            pull_point = self.points(0.0, through[0], nodes).points[0]
-        guides = self.points(places, through, nodes)
-        return Cable(name, guides, np.asarray(pull_point), unilateral=unilateral, compliance=compliance)
+            pull_point = self.points(0.0, through[0], model.nodes).points[0]
+        guides = self.points(places, through, model.nodes)
+        cable = Cable(name, guides, np.asarray(pull_point), unilateral=unilateral, compliance=compliance)
+        model.add("a", cable)
+        return cable
+
+
+@explained
+def add_rod(
+    builder: ModelBuilder,
+    path: ArrayLike,
+    *,
+    section: Section | Callable[[float], Section],
+    elements: int | Sequence[float] | np.ndarray = 10,
+    order: int = 2,
+    up: ArrayLike | None = None,
+    held: str = "start",
+    **options: Any,
+) -> Rod:
+    """Add a rod to a builder: beam elements along a line, with the surface of its sections.
+
+    Args:
+        builder: of the model.
+        path: both ends of a straight rod [m], shape (2, 3), or all frames of a curved one, shape (c, 3). The rod is
+            free of stress in this shape.
+        section: of all elements, or a function of the place along the rod [m] that returns that of the element with its
+            middle there.
+        elements: of a straight rod: a number of equal ones, or their ends along the rod [m], e.g. at its discs.
+        order: 1 or 2, see `Beam`; with 2 every second frame is the middle of an element.
+        up: direction of d_2 at the start; default: the axis of space that is least along the rod.
+        held: which ends are clamped: ``"start"``, ``"both"`` or ``"none"``.
+        **options: ``young_modulus`` and others of `Beam`.
+
+    Raises:
+        ValueError: for a path or elements that describe no rod.
+    """
+    points = np.asarray(path, dtype=float)
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2 or not np.isfinite(points).all():
+        raise ValueError(f"the path of a rod must be two or more points [m] of three finite numbers, got {path!r}")
+    if held not in ENDS:
+        raise ValueError(f"held = {held!r} is unknown; allowed: {', '.join(ENDS)}")
+    if len(points) == 2:
+        places = straight_places(float(np.linalg.norm(points[1] - points[0])), elements, order)
+        points = points[0] + (places / places[-1])[:, None] * (points[1] - points[0])
+    else:
+        places = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    clamped = np.isin(np.arange(len(points)), np.array(ENDS[held], dtype=int) % len(points))
+    frames = [
+        builder.add_frame(point, rotation, fixed=bool(fix), fixed_spin=bool(fix))
+        for point, rotation, fix in zip(points, transported_frames(points, up), clamped, strict=True)
+    ]
+    middles = 0.5 * (places[:-order:order] + places[order::order])
+    sections = section if isinstance(section, Section) else [section(float(s)) for s in middles]
+    number = builder.add_element(Beam, frames, section=sections, order=order, **options)
+    rod, outline = Rod(frames, places), outlines(section, places)
+
+    def complete(model: MechanicalModel) -> None:
+        beam = model.blocks[number]
+        assert isinstance(beam, Beam)
+        rod.beam = beam
+        if outline is not None:
+            model.skins.append(tube_skin(beam, model.nodes, outline))
+
+    builder.finish(complete)
+    return rod
 
 
 def straight_places(length: float, elements: int | Sequence[float] | np.ndarray, order: int) -> np.ndarray:

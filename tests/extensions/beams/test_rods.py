@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_bvp
 
-from softgym_envs.mechanics import MechanicalModel, ModelBuilder, Section, Statics
+from softgym_envs.extensions.beams import Section, add_rod
+from softgym_envs.mechanics import MechanicalModel, ModelBuilder, Statics
 from softgym_envs.mechanics.solvers.dynamics import Dynamics
 
 LENGTH, RADIUS, MODULUS, OFFSET = 0.2, 5e-4, 60e9, 4.5e-3
@@ -17,8 +18,8 @@ STEEL = {"section": Section.circle(8e-4), "young_modulus": 200e9, "poisson_ratio
 
 def rod_model(path, gravity=(0.0, 0.0, 0.0), **options):
     builder = ModelBuilder(gravity=gravity)
-    builder.add_rod(path, **options)
-    return builder.build()
+    rod = add_rod(builder, path, **options)
+    return builder.build(), rod
 
 
 def straight(elements=20, **options):
@@ -27,16 +28,16 @@ def straight(elements=20, **options):
     return rod_model([[0, 0, 0], [0, 0, LENGTH]], elements=elements, **given)
 
 
-def tip(model, state):
-    return model.rods[0].points(model.rods[0].length, (0.0, 0.0), model.nodes).positions(state.x)[0]
+def tip(model, rod, state):
+    return rod.points(rod.length, (0.0, 0.0), model.nodes).positions(state.x)[0]
 
 
 def with_tendons(discs=20, angles=(0.0, np.pi), **options):
-    model = straight(discs)
+    model, rod = straight(discs)
     for k, angle in enumerate(angles):
         offset = OFFSET * np.array([np.cos(angle), np.sin(angle)])
-        model.add_tendon(f"tendon_{k}", np.linspace(0.0, LENGTH, discs + 1)[1:], offset, **options)
-    return model
+        rod.add_tendon(model, f"tendon_{k}", np.linspace(0.0, LENGTH, discs + 1)[1:], offset, **options)
+    return model, rod
 
 
 @pytest.mark.parametrize("tension", [0.5, 2.0, 5.0])
@@ -45,20 +46,20 @@ def test_a_tendon_bends_a_rod_to_a_circle(tension):
 
     It runs straight from disc to disc, so it is farther from the axis between them: by 0.4 % with 40 discs.
     """
-    model = with_tendons(discs=40)
+    model, rod = with_tendons(discs=40)
     state = Statics(model).solve([tension, 0.0], "effort")
     curvature = tension * OFFSET / EI
     angle = curvature * LENGTH
     length = LENGTH * (1.0 - tension / EA)
     arc = length / angle * np.array([1.0 - np.cos(angle), 0.0, np.sin(angle)])
-    error = np.linalg.norm(tip(model, state) - arc)
+    error = np.linalg.norm(tip(model, rod, state) - arc)
     print(f"{tension} N: {np.degrees(angle):.0f} degrees, {1e3 * error:.3f} mm of {1e3 * np.linalg.norm(arc):.0f} mm")
     assert error < 0.005 * LENGTH
     assert state.delta[0] == pytest.approx(angle * OFFSET + tension * LENGTH / EA, rel=6e-3)
 
 
 def test_a_pulled_tendon_leaves_its_antagonist_slack():
-    model = with_tendons()
+    model, rod = with_tendons()
     state = Statics(model).solve([0.004, -0.010])
     assert state.effort[0] > 0.0 and state.effort[1] == 0.0
     np.testing.assert_array_equal(state.slack, [False, True])
@@ -78,10 +79,10 @@ def test_the_elastica(load):
         tol=1e-9,
     )
     assert solved.success
-    model = straight()
-    end = model.rods[0].points(LENGTH, (0.0, 0.0), model.nodes)
+    model, rod = straight()
+    end = rod.points(LENGTH, (0.0, 0.0), model.nodes)
     model.add_load("weight", [load * EI / LENGTH**2, 0.0, 0.0], end)
-    found = tip(model, Statics(model).solve([]))
+    found = tip(model, rod, Statics(model).solve([]))
     np.testing.assert_allclose(found, LENGTH * np.array([solved.y[3, -1], 0.0, solved.y[2, -1]]), atol=5e-4 * LENGTH)
 
 
@@ -115,8 +116,8 @@ def test_shapes_that_sorosim_published(gravity, middle, end, shape):
     From `data/reference/sorosim/sorosim_statics/SpringSteelRodMuJoCo_dataStatics.csv` of
     github.com/ContinuumRoboticsLab/opencr-mujoco (MIT), shapes 1 to 3, which have four digits.
     """
-    model = rod_model([[0, 0, 0], [0.6, 0, 0]], elements=20, up=[0, 1, 0], gravity=gravity, **STEEL)
-    solver, chain = Statics(model), model.rods[0].beam.chain
+    model, rod = rod_model([[0, 0, 0], [0.6, 0, 0]], elements=20, up=[0, 1, 0], gravity=gravity, **STEEL)
+    solver, chain = Statics(model), rod.beam.chain
     x = model.nodes
     # A moment M is the forces M x d_k / 2 on the directors, which turn with them: repeat until they rest.
     for k in range(1, 80):
@@ -134,11 +135,11 @@ def test_shapes_that_sorosim_published(gravity, middle, end, shape):
 
 
 def test_a_distributed_load_is_what_gravity_is():
-    heavy = straight(gravity=(9.81, 0.0, 0.0))
-    loaded = straight()
-    loaded.add_load("weight", [9.81 * loaded.mass, 0.0, 0.0], loaded.rods[0])
+    heavy, _ = straight(gravity=(9.81, 0.0, 0.0))
+    loaded, rod = straight()
+    loaded.add_load("weight", [9.81 * loaded.mass, 0.0, 0.0], rod.spread())
     np.testing.assert_allclose(Statics(loaded).solve([]).x, Statics(heavy).solve([]).x, atol=1e-9)
-    loaded.add_load("weight", [0.0, 0.0, 0.0], loaded.rods[0])  # the same name: changed, not added
+    loaded.add_load("weight", [0.0, 0.0, 0.0], rod.spread())  # the same name: changed, not added
     np.testing.assert_allclose(loaded.nodal_loads, 0.0, atol=1e-15)
 
 
@@ -167,13 +168,13 @@ def test_a_load_on_an_edge_follows_its_length(box):
 def test_a_drive_that_stretches():
     """What a command lacks is compliance times tension, and the tendon is a spring in series with the body."""
     stretch = 2e-4
-    stiff, soft = with_tendons(), with_tendons(compliance=stretch)
+    (stiff, _), (soft, rod) = with_tendons(), with_tendons(compliance=stretch)
     found = Statics(soft).solve([0.006, 0.0015])
     np.testing.assert_allclose(found.delta[:2] + stretch * found.effort[:2], [0.006, 0.0015], atol=1e-10)
     same = Statics(stiff).solve(found.delta[:2])
     np.testing.assert_allclose(same.x, found.x, atol=1e-9)
     # The tip moves with the command by W_ea (W_aa + C)^-1.
-    soft.add_effector("tip", soft.rods[0].points(LENGTH, (0.0, 0.0), soft.nodes))
+    soft.add_effector("tip", rod.points(LENGTH, (0.0, 0.0), soft.nodes))
     solver, step = Statics(soft), 1e-6
     base = solver.solve([0.006, 0.0015])
     exact = base.condensed.W.ea @ np.linalg.inv(base.condensed.W.aa + stretch * np.eye(2))
@@ -185,8 +186,7 @@ def test_a_drive_that_stretches():
 
 
 def test_points_between_frames_and_tapered_sections():
-    model = straight(elements=8, section=lambda s: Section.circle(1e-3 * (1.0 - 0.5 * s / LENGTH)))
-    rod = model.rods[0]
+    model, rod = straight(elements=8, section=lambda s: Section.circle(1e-3 * (1.0 - 0.5 * s / LENGTH)))
     between = rod.points([0.0137, 0.1], [[0.001, 0.002], [0.0, 0.0]], model.nodes)
     np.testing.assert_allclose(between.points, [[0.001, 0.002, 0.0137], [0.0, 0.0, 0.1]], atol=1e-12)
     # d_1 along z, d_2 along x: d_3 along y.
@@ -204,9 +204,9 @@ def test_a_curved_rod_is_free_of_stress():
     turns = np.linspace(0.0, np.pi / 2.0, 21)
     path = 0.1 * np.column_stack([np.sin(turns), np.zeros(21), 1.0 - np.cos(turns)])
     builder = ModelBuilder()
-    frames = builder.add_rod(path, section=SECTION, young_modulus=MODULUS, held="both")
+    rod = add_rod(builder, path, section=SECTION, young_modulus=MODULUS, held="both")
     model = builder.build()
-    assert len(frames) == 21 and model.rods[0].length == pytest.approx(0.05 * np.pi, rel=1e-3)
+    assert len(rod.frames) == 21 and rod.length == pytest.approx(0.05 * np.pi, rel=1e-3)
     assert model.elastic_energy(model.nodes) == pytest.approx(0.0, abs=1e-15)
     np.testing.assert_allclose(Statics(model).solve([]).x, model.nodes, atol=1e-12)
 
