@@ -308,7 +308,7 @@ def inference() -> dict[str, object]:
     import torch
 
     from softgym_envs.robots.registry import make_robot
-    from softgym_envs.surrogate.potential.torch import TorchModel
+    from softgym_envs.extensions.fitting.torch_potential import TorchModel
     from softgym_envs.surrogate.pretrained import pretrained_model, shipped_robots
 
     torch.set_num_threads(1)

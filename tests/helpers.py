@@ -23,7 +23,7 @@ from softgym_envs.robots.base import Actuator, Robot
 
 if TYPE_CHECKING:
     from softgym_envs.surrogate.potential.model import Model
-    from softgym_envs.surrogate.potential.torch import PotentialNet
+    from softgym_envs.extensions.fitting.torch_potential import PotentialNet
 
 # -- meshes and bodies --------------------------------------------------------------------------------------------
 
@@ -82,7 +82,7 @@ def clamped_beam(order: int = 1, shape: str = "straight", elements: int = 3, **o
         order: order of the beam elements, 1 or 2.
         shape: ``"straight"`` or ``"curved"``, which follows a helix with twisted sections.
         elements: number of elements; their modulus grows along the beam.
-        **options: of `ModelBuilder.add_beam`.
+        **options: of `Beam`.
     """
     builder = ModelBuilder()
     frames = []
@@ -290,7 +290,7 @@ def untrained_potential(
     from softgym_envs.extensions.fitting.potential import stack_members
     from softgym_envs.surrogate.features import Features
     from softgym_envs.surrogate.potential.model import Model
-    from softgym_envs.surrogate.potential.torch import PotentialNet
+    from softgym_envs.extensions.fitting.torch_potential import PotentialNet
 
     torch.manual_seed(seed)
     n, e = len(robot.actuators), 3 * len(robot.effectors)

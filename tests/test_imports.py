@@ -35,8 +35,10 @@ LAYERS = [
     {"softgym_envs.viewer"},
     {"softgym_envs.cli"},
     # Extensions: no core package imports one. Those of one layer do not know each other.
+    {"softgym_envs.extensions.paths"},
     {"softgym_envs.extensions", "softgym_envs.extensions.beams", "softgym_envs.extensions.checks"}
-    | {"softgym_envs.extensions.postgres", "softgym_envs.extensions.recordings", "softgym_envs.extensions.sweeps"},
+    | {"softgym_envs.extensions.motion", "softgym_envs.extensions.postgres", "softgym_envs.extensions.recordings"}
+    | {"softgym_envs.extensions.sweeps"},
     {"softgym_envs.extensions.fitting", "softgym_envs.extensions.report"},
     {"softgym_envs.extensions.design"},
     {

@@ -27,7 +27,7 @@ from softgym_envs.robots.soft_finger import SoftFinger
 from softgym_envs.runs import RunFolder
 from softgym_envs.storage import read_json
 from softgym_envs.surrogate.identity import class_of, difference, fingerprint
-from softgym_envs.surrogate.inertia import read_inertia
+from softgym_envs.extensions.motion.inertia import read_inertia
 from softgym_envs.surrogate.pretrained import pretrained_folder
 from softgym_envs.surrogate.weight_files import load_model
 from tests.test_units import Bar

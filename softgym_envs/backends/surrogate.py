@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,12 +22,11 @@ from softgym_envs.backends.backend import (
     refuse_force,
 )
 from softgym_envs.backends.batch import BatchBackend, BatchState
-from softgym_envs.backends.surrogate_motion import SurrogateMotion
 from softgym_envs.backends.time_steps import TimeSteps, check_still
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 from softgym_envs.mechanics.condensation import CondensedModel
+from softgym_envs.registry import Table
 from softgym_envs.robots.base import Robot
-from softgym_envs.surrogate.inertia import read_inertia
 from softgym_envs.surrogate.model import Context, SurrogateModel
 from softgym_envs.surrogate.pretrained import pretrained_folder, standalone_model
 
@@ -173,9 +173,11 @@ def _only(condensed: Callable[..., CondensedModel], *of: object) -> CondensedMod
     return replace(many, compliance=many.compliance[0], free=many.free[0], effort=many.effort[0])
 
 
-def _motion_of(
-    model: SurrogateModel, weights: str | Path | None, dynamics: bool, steps: TimeSteps
-) -> SurrogateMotion | None:
+MOTIONS = Table("motion of surrogates", {}, group="softgym_envs.motions")
+"""Classes that step bodies of learned models in time, such as `softgym_envs.extensions.motion.motion.SurrogateMotion`."""
+
+
+def _motion_of(model: SurrogateModel, weights: str | Path | None, dynamics: bool, steps: TimeSteps) -> Any:
     """Return what steps bodies of a model in time; None without dynamics.
 
     Raises:
@@ -186,8 +188,7 @@ def _motion_of(
     if not dynamics:
         check_still(steps)
         return None
-    folder = pretrained_folder(model.robot) if weights is None else Path(weights)
-    return SurrogateMotion(model, read_inertia(folder, model.robot), steps)
+    return MOTIONS["inertia"](model, pretrained_folder(model.robot) if weights is None else Path(weights), steps)
 
 
 def _all_by_effort(robot: Robot, dynamics: bool) -> bool:
@@ -264,7 +265,7 @@ class SurrogateBatch(BatchBackend):
         self._context = Context.shared(one, count)
         self._rest, self.state = rest.repeat(count), rest.repeat(count)
         if self._motion is not None:
-            self._inertia = self._motion.inertia.body(designs)
+            self._inertia = self._motion.body(designs)
             self._moving = self._motion.at_rest(self._context, self._rest.displacement, self._rest.effort)
             self._settled = rest.repeat(count)
         other = np.flatnonzero((designs != designs[:1]).any(axis=1))
@@ -320,7 +321,7 @@ class SurrogateBatch(BatchBackend):
         self._touched[index], self._designs[index] = False, designs
         self._rest = self._rest.replaced(index, rest)
         if self._motion is not None:
-            self._inertia[index] = self._motion.inertia.body(designs)
+            self._inertia[index] = self._motion.body(designs)
         self.rest(index)
         return {}
 

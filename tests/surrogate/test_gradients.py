@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from softgym_envs import make_robot
-from softgym_envs.surrogate.potential.torch import TorchModel
+from softgym_envs.extensions.fitting.torch_potential import TorchModel
 from tests.helpers import random_states, untrained_potential
 from tests.surrogate.test_model import untrained_residual
 

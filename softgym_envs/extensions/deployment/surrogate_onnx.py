@@ -59,7 +59,7 @@ def _traced(model: Model) -> bytes:
     """Return the graph of a model as torch exports it."""
     import torch
 
-    from softgym_envs.surrogate.potential.torch import TorchModel
+    from softgym_envs.extensions.fitting.torch_potential import TorchModel
 
     net = TorchModel(model, dtype=torch.float32, inverse=_eliminate).eval()
     design = torch.tensor(model.robot.design_space.baseline.array, dtype=torch.float32).expand(2, -1)

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 from softgym_envs._lazy import lazy_exports
 
 if TYPE_CHECKING:
+    from softgym_envs.extensions.fitting.torch_potential import TorchModel as TorchModel
     from softgym_envs.extensions.fitting.training import FitConfig as FitConfig
     from softgym_envs.extensions.fitting.training import fit as fit
 
-__getattr__, __dir__, __all__ = lazy_exports(__name__, {"training": ["FitConfig", "fit"]})
+__getattr__, __dir__, __all__ = lazy_exports(__name__, {"torch_potential": ["TorchModel"], "training": ["FitConfig", "fit"]})

@@ -534,7 +534,7 @@ def _climb(
     import torch
 
     from softgym_envs.surrogate.potential.model import Model
-    from softgym_envs.surrogate.potential.torch import PotentialEnsemble
+    from softgym_envs.extensions.fitting.torch_potential import PotentialEnsemble
 
     assert isinstance(model, Model)
     ensemble = PotentialEnsemble.of_model(model, dtype=torch.float32)

@@ -163,7 +163,7 @@ def fit_inertia(
     the weights.
     """
     from softgym_envs.extensions.fitting.inertia_training import fit_inertia as run
-    from softgym_envs.surrogate.inertia import write_inertia
+    from softgym_envs.extensions.motion.inertia import write_inertia
 
     body = options.robot_of(robot, options_)
     found = run(body, bodies=bodies, states=states, degree=degree, workers=workers, progress=True)

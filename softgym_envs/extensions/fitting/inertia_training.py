@@ -15,7 +15,7 @@ from softgym_envs.extensions.fitting.reduction import reduce_motion
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.features import Features
-from softgym_envs.surrogate.inertia import (
+from softgym_envs.extensions.motion.inertia import (
     LearnedInertia,
     Polynomials,
     half_stiffness,

@@ -17,7 +17,7 @@ from softgym_envs.surrogate.potential.model import Model as Model
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from softgym_envs.surrogate.potential.torch import PotentialNet
+    from softgym_envs.extensions.fitting.torch_potential import PotentialNet
 
 
 class Options(TrainingOptions):
@@ -94,7 +94,7 @@ def _train_member(
     """Train one member; return its number, weights and history."""
     import torch
 
-    from softgym_envs.surrogate.potential.torch import PotentialNet
+    from softgym_envs.extensions.fitting.torch_potential import PotentialNet
 
     torch.set_num_threads(1)
     options: Options = trainer.options

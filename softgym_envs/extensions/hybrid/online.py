@@ -236,7 +236,7 @@ def fine_tune(
     require("train")
     import torch
 
-    from softgym_envs.surrogate.potential.torch import PotentialNet
+    from softgym_envs.extensions.fitting.torch_potential import PotentialNet
 
     check_ensemble(model)
     start = time.perf_counter()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from softgym_envs.backends.fem import FEMBackend
-from softgym_envs.backends.hybrid_path import PathHybridBackend
+from softgym_envs.extensions.paths.hybrid import PathHybridBackend
 from softgym_envs.extensions.modules.modular_arm import ModularArm
 
 

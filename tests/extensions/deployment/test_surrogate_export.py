@@ -47,7 +47,7 @@ def random_model(case, seed=0, learned=None):
     """
     import torch
 
-    from softgym_envs.surrogate.potential.torch import PotentialNet
+    from softgym_envs.extensions.fitting.torch_potential import PotentialNet
 
     name, options, at_rest, members = CASES[case]
     robot = make_robot(name, **options)

@@ -16,7 +16,7 @@ from softgym_envs.extensions.fitting.training import FitConfig
 from softgym_envs.extensions.gpu.surrogates import TorchBatch
 from softgym_envs.surrogate.correction import EffortCorrection
 from softgym_envs.surrogate.potential.model import Model
-from softgym_envs.surrogate.potential.torch import TorchModel
+from softgym_envs.extensions.fitting.torch_potential import TorchModel
 from softgym_envs.surrogate.pretrained import pretrained_folder
 from tests.helpers import random_states, untrained_potential
 

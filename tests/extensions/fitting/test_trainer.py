@@ -14,7 +14,7 @@ from softgym_envs.extensions.fitting.trainer import Trainer
 from softgym_envs.extensions.networks import thesis
 from softgym_envs.extensions.networks.perceptron import perceptron
 from softgym_envs.surrogate.potential.model import Model
-from softgym_envs.surrogate.potential.torch import PotentialNet
+from softgym_envs.extensions.fitting.torch_potential import PotentialNet
 from softgym_envs.surrogate.pretrained import pretrained_model
 from tests.helpers import random_states
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from softgym_envs.backends import hybrid_path
+from softgym_envs.extensions.paths import hybrid
 from softgym_envs.backends.registry import make_backend
 from softgym_envs.errors import InfeasibleDesign, WeightsError
 from softgym_envs.extensions.grasping.backends.chain import ChainBackend, HybridChainBackend
@@ -159,7 +159,7 @@ class Recorder(ChainBackend):
 
 
 def test_finite_elements_follow_the_whole_path(robot, monkeypatch):
-    monkeypatch.setattr(hybrid_path, "FEMBackend", Recorder)
+    monkeypatch.setattr(hybrid, "FEMBackend", Recorder)
     Recorder.steps = 0
     thin = {"e1": 0.008, "e2": 0.005, "e3": 0.004, "object_gap": 0.0301}
     backend, alone = HybridChainBackend(robot, thin), ChainBackend(robot, thin)
@@ -186,7 +186,7 @@ def test_finite_elements_follow_the_whole_path(robot, monkeypatch):
 
 
 def test_unknown_bodies_are_given_to_finite_elements(robot, monkeypatch):
-    monkeypatch.setattr(hybrid_path, "FEMBackend", Recorder)
+    monkeypatch.setattr(hybrid, "FEMBackend", Recorder)
     Recorder.steps = 0
     backend = HybridChainBackend(robot, {"e3": 0.002})
     backend.step(np.radians([2.0]))
@@ -197,7 +197,7 @@ def test_unknown_bodies_are_given_to_finite_elements(robot, monkeypatch):
 
 def test_copies_and_other_bodies_go_on_with_finite_elements_of_their_own(robot, monkeypatch):
     """Finite elements may be missing, or be those of another body, where a state goes on that they have found."""
-    monkeypatch.setattr(hybrid_path, "FEMBackend", Recorder)
+    monkeypatch.setattr(hybrid, "FEMBackend", Recorder)
     thin = {"e1": 0.008, "e2": 0.005, "e3": 0.004, "object_gap": 0.0301}
     backend = HybridChainBackend(robot, thin)
     assert backend.state.trusted  # at rest, without finite elements
@@ -217,7 +217,7 @@ def test_a_body_that_finite_elements_refuse_changes_nothing(robot, monkeypatch):
     def refuse(*args):
         raise InfeasibleDesign("the mesh crosses itself")
 
-    monkeypatch.setattr(hybrid_path, "FEMBackend", refuse)
+    monkeypatch.setattr(hybrid, "FEMBackend", refuse)
     with pytest.raises(InfeasibleDesign, match="crosses itself"):
         backend.reset({"e3": 0.002})
     backend.reset(BODY)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from softgym_envs.backends import hybrid_path
+from softgym_envs.extensions.paths import hybrid
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.backends.registry import make_backend
 from softgym_envs.errors import InfeasibleDesign
@@ -190,7 +190,7 @@ def test_hybrid_hands_follow_with_finite_elements(monkeypatch):
             asked.append(command)
             return super().step(command, mode, force=force)
 
-    monkeypatch.setattr(hybrid_path, "FEMBackend", Recorder)
+    monkeypatch.setattr(hybrid, "FEMBackend", Recorder)
     robot = make_robot("contact_aided_gripper")
     backend, alone = make_backend("hybrid", robot), hand(robot)
     assert isinstance(backend, HybridHandBackend) and backend.moving

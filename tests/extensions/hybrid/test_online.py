@@ -65,7 +65,7 @@ def test_stacking_members_inverts_unstacking(model):
 def test_members_in_torch_agree_with_the_kernel(model, robot):
     import torch
 
-    from softgym_envs.surrogate.potential.torch import PotentialNet
+    from softgym_envs.extensions.fitting.torch_potential import PotentialNet
 
     states, scales = unstack_members(model.tensors)
     displacement = np.linspace(0.0, 0.02, 7)[:, None]

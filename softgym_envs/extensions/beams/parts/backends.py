@@ -11,7 +11,7 @@ import numpy as np
 
 from softgym_envs.backends.backend import PointForce, State
 from softgym_envs.backends.fem import FEMBackend
-from softgym_envs.backends.hybrid_path import PathHybridBackend
+from softgym_envs.extensions.paths.hybrid import PathHybridBackend
 from softgym_envs.designs import Design
 from softgym_envs.extensions.beams.parts.trust import judge
 from softgym_envs.extensions.beams.parts.weights import of_learned_parts

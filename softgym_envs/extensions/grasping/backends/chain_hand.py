@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from softgym_envs.backends.backend import Backend, State, check_numbers, refuse_force
-from softgym_envs.backends.hybrid_path import PathHybridBackend
+from softgym_envs.extensions.paths.hybrid import PathHybridBackend
 from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 from softgym_envs.extensions.beams.skins import box_skin

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from softgym_envs.backends.fem import FEMBackend
-from softgym_envs.backends.hybrid_path import PathHybridBackend
+from softgym_envs.extensions.paths.hybrid import PathHybridBackend
 from softgym_envs.designs import Design
 from softgym_envs.errors import WeightsError
 from softgym_envs.extensions.grasping.held_fingers import CABLES, HeldFingers, LearnedFinger

@@ -1,4 +1,4 @@
-"""Motion of a learned condensed model in time: its energy, and the learned inertia of `softgym_envs.surrogate.inertia`.
+"""Motion of a learned condensed model in time: its energy, and the learned inertia of `softgym_envs.extensions.motion.inertia`.
 
 The coordinates are the constraint values of the body (displacements ``q`` of its actuators and positions ``e`` of its
 effectors) and the amplitudes ``r`` of its inner modes. With the equilibrium effectors ``x(q)`` and ``z = e - x(q)``,
@@ -15,13 +15,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from pathlib import Path
+
 import numpy as np
 
 from softgym_envs.backends.batch import BatchState, Rows
 from softgym_envs.backends.time_steps import TimeSteps
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.solvers.complementarity import solve_rows
-from softgym_envs.surrogate.inertia import LearnedInertia, half_stiffness
+from softgym_envs.extensions.motion.inertia import half_stiffness, read_inertia
 from softgym_envs.surrogate.model import Context, SurrogateModel
 
 ITERATIONS = 20
@@ -53,12 +55,20 @@ class SurrogateMotion:
 
     Args:
         model: the learned condensed model.
-        inertia: of the same robot.
+        folder: of weights, with the learned inertia of the same robot.
         steps: time steps and damping.
+
+    Attributes:
+        inertia: the learned inertia.
+        body: see `LearnedInertia.body`.
+
+    Raises:
+        WeightsError: if there is no inertia in the folder, or it does not fit.
     """
 
-    def __init__(self, model: SurrogateModel, inertia: LearnedInertia, steps: TimeSteps) -> None:
-        self.model, self.inertia, self.steps = model, inertia, steps
+    def __init__(self, model: SurrogateModel, folder: str | Path, steps: TimeSteps) -> None:
+        self.model, self.inertia, self.steps = model, read_inertia(folder, model.robot), steps
+        self.body = self.inertia.body
         self._actuators, self._values = model.count, model.size
 
     def at_rest(self, context: Context, displacement: np.ndarray, effort: np.ndarray) -> MotionState:

@@ -10,11 +10,11 @@ import softgym_envs  # noqa: F401  registers the environments
 from softgym_envs.agents.config import EnvironmentConfig
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.backends.surrogate import SurrogateBackend, SurrogateBatch
-from softgym_envs.backends.surrogate_motion import SurrogateMotion
+from softgym_envs.extensions.motion.motion import SurrogateMotion
 from softgym_envs.backends.time_steps import TimeSteps
 from softgym_envs.errors import WeightsError
 from softgym_envs.robots.registry import make_robot
-from softgym_envs.surrogate.inertia import half_stiffness, read_inertia
+from softgym_envs.extensions.motion.inertia import half_stiffness
 from softgym_envs.surrogate.pretrained import pretrained_folder, pretrained_model
 
 SOFT = {"young_modulus": 1.0e6}
@@ -93,7 +93,7 @@ def test_energy_does_not_grow_without_input(name):
     """Undamped, with held actuators, after a violent command: implicit Euler only takes energy away."""
     robot = make_robot(name, unilateral=False)
     model = pretrained_model(robot)
-    motion = SurrogateMotion(model, read_inertia(pretrained_folder(robot), robot), TimeSteps(stiffness_damping=0.0))
+    motion = SurrogateMotion(model, pretrained_folder(robot), TimeSteps(stiffness_damping=0.0))
     designs = robot.design_space.baseline.array[None]
     context, body = model.context(designs), motion.inertia.body(designs)
     zero = np.zeros((1, model.count))

@@ -13,7 +13,7 @@ from softgym_envs.extensions.fitting.inertia_training import fit_inertia
 from softgym_envs.extensions.fitting.reduction import reduce_motion
 from softgym_envs.mechanics.solvers.statics import Statics
 from softgym_envs.robots.registry import make_robot
-from softgym_envs.surrogate.inertia import (
+from softgym_envs.extensions.motion.inertia import (
     FILE,
     LearnedInertia,
     Polynomials,

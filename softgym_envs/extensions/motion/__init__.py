@@ -1,0 +1,1 @@
+"""Motion of bodies on surrogates: learned inertia, and the time steps that it makes possible."""

@@ -1,0 +1,1 @@
+"""Hybrid backends whose states depend on the path."""
