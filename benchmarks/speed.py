@@ -307,8 +307,8 @@ def inference() -> dict[str, object]:
     """Microseconds per call of the shipped networks: state, condensed model, and the torch model for comparison."""
     import torch
 
-    from softgym_envs.robots.registry import make_robot
     from softgym_envs.extensions.fitting.torch_potential import TorchModel
+    from softgym_envs.robots.registry import make_robot
     from softgym_envs.surrogate.pretrained import pretrained_model, shipped_robots
 
     torch.set_num_threads(1)

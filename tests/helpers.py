@@ -22,8 +22,8 @@ from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Actuator, Robot
 
 if TYPE_CHECKING:
-    from softgym_envs.surrogate.potential.model import Model
     from softgym_envs.extensions.fitting.torch_potential import PotentialNet
+    from softgym_envs.surrogate.potential.model import Model
 
 # -- meshes and bodies --------------------------------------------------------------------------------------------
 
@@ -288,9 +288,9 @@ def untrained_potential(
     import torch
 
     from softgym_envs.extensions.fitting.potential import stack_members
+    from softgym_envs.extensions.fitting.torch_potential import PotentialNet
     from softgym_envs.surrogate.features import Features
     from softgym_envs.surrogate.potential.model import Model
-    from softgym_envs.extensions.fitting.torch_potential import PotentialNet
 
     torch.manual_seed(seed)
     n, e = len(robot.actuators), 3 * len(robot.effectors)

@@ -22,12 +22,12 @@ from softgym_envs.config import load_config
 from softgym_envs.errors import ConfigError, DataError, WeightsError
 from softgym_envs.extensions.leaderboard.board import _escaped
 from softgym_envs.extensions.leaderboard.submission import Submission
+from softgym_envs.extensions.motion.inertia import read_inertia
 from softgym_envs.registry import ALLOW_CODE
 from softgym_envs.robots.soft_finger import SoftFinger
 from softgym_envs.runs import RunFolder
 from softgym_envs.storage import read_json
 from softgym_envs.surrogate.identity import class_of, difference, fingerprint
-from softgym_envs.extensions.motion.inertia import read_inertia
 from softgym_envs.surrogate.pretrained import pretrained_folder
 from softgym_envs.surrogate.weight_files import load_model
 from tests.test_units import Bar

@@ -174,7 +174,7 @@ def _only(condensed: Callable[..., CondensedModel], *of: object) -> CondensedMod
 
 
 MOTIONS = Table("motion of surrogates", {}, group="softgym_envs.motions")
-"""Classes that step bodies of learned models in time, such as `softgym_envs.extensions.motion.motion.SurrogateMotion`."""
+"""Classes that step bodies of learned models in time, made of the model, the folder of its weights and `TimeSteps`."""
 
 
 def _motion_of(model: SurrogateModel, weights: str | Path | None, dynamics: bool, steps: TimeSteps) -> Any:

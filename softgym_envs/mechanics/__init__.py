@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from softgym_envs.mechanics.contact.obstacles import Cylinder as Cylinder
     from softgym_envs.mechanics.contact.obstacles import MeshObstacle as MeshObstacle
     from softgym_envs.mechanics.contact.obstacles import Plane as Plane
-    from softgym_envs.mechanics.contact.obstacles import RoundedPrism as RoundedPrism
     from softgym_envs.mechanics.contact.obstacles import Sphere as Sphere
     from softgym_envs.mechanics.io import read_mesh as read_mesh
     from softgym_envs.mechanics.mesh_checks import merge_nodes as merge_nodes
@@ -31,7 +30,7 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "constraints.embedding": ["EmbeddedPoints"],
         "constraints.point": ["Point"],
         "constraints.slide": ["Slide"],
-        "contact.obstacles": ["Cylinder", "MeshObstacle", "Plane", "RoundedPrism", "Sphere"],
+        "contact.obstacles": ["Cylinder", "MeshObstacle", "Plane", "Sphere"],
         "io": ["read_mesh"],
         "mesh_checks": ["merge_nodes"],
         "model": ["MechanicalModel"],

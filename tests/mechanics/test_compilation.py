@@ -83,7 +83,7 @@ def printed(module, folder):
     [
         ("extensions/beams/solver/batch.py", True),
         ("extensions/beams/solver/motion.py", True),
-        ("mechanics/elements/beam_kernels.py", True),  # over equations
+        ("extensions/beams/beam_kernels.py", True),  # over equations
         ("mechanics/solvers/equilibrium.py", True),  # constants
         ("mechanics/contact/obstacles.py", True),  # its classes are named beside the kernels of contact
         ("mechanics/solvers/statics.py", False),

@@ -9,12 +9,13 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from softgym_envs.extensions.beams.beam import Beam, Section
+from softgym_envs.extensions.beams.prism import RoundedPrism
 from softgym_envs.extensions.beams.skins import box_skin, tube_skin
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.contact.contact import ContactSettings, ContactState
-from softgym_envs.mechanics.contact.obstacles import Cylinder, MeshObstacle, Plane, RoundedPrism, Sphere
+from softgym_envs.mechanics.contact.obstacles import Cylinder, MeshObstacle, Plane, Sphere
 from softgym_envs.mechanics.elements.rigid import box_inertia
 from softgym_envs.mechanics.solvers.dynamics import Dynamics
 from softgym_envs.mechanics.solvers.statics import Statics

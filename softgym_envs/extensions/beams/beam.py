@@ -18,9 +18,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from softgym_envs.extensions.beams.beam_kernels import interpolate, pull_back, strains
 from softgym_envs.mechanics.compilation import njit
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
-from softgym_envs.mechanics.elements.beam_kernels import interpolate, pull_back, strains
 from softgym_envs.mechanics.elements.block import ElementBlock, StrainRates, lower_pairs
 from softgym_envs.mechanics.elements.tetrahedra import check_density, element_masses
 from softgym_envs.quantities import finite_number, numbers

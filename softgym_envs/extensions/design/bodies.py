@@ -22,10 +22,10 @@ from softgym_envs.codesign.variables import split_values
 from softgym_envs.errors import ConfigError
 from softgym_envs.executors import parallel_map
 from softgym_envs.extensions.design.metrics import ActuationPath
+from softgym_envs.extensions.fitting.torch_potential import TorchModel
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Robot
 from softgym_envs.surrogate.potential.model import Model
-from softgym_envs.extensions.fitting.torch_potential import TorchModel
 from softgym_envs.surrogate.pretrained import pretrained_model
 
 Key = TypeVar("Key")

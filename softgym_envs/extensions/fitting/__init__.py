@@ -12,4 +12,6 @@ if TYPE_CHECKING:
     from softgym_envs.extensions.fitting.training import FitConfig as FitConfig
     from softgym_envs.extensions.fitting.training import fit as fit
 
-__getattr__, __dir__, __all__ = lazy_exports(__name__, {"torch_potential": ["TorchModel"], "training": ["FitConfig", "fit"]})
+__getattr__, __dir__, __all__ = lazy_exports(
+    __name__, {"torch_potential": ["TorchModel"], "training": ["FitConfig", "fit"]}
+)

@@ -533,8 +533,8 @@ def _climb(
     """Move bodies x (B, d) and commands c (B, S, n) up the gradient of the spread, as long as they are trusted."""
     import torch
 
-    from softgym_envs.surrogate.potential.model import Model
     from softgym_envs.extensions.fitting.torch_potential import PotentialEnsemble
+    from softgym_envs.surrogate.potential.model import Model
 
     assert isinstance(model, Model)
     ensemble = PotentialEnsemble.of_model(model, dtype=torch.float32)

@@ -12,9 +12,6 @@ from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 from softgym_envs.executors import parallel_map
 from softgym_envs.extensions.fitting.data.sampling import SamplingPlan, solve_path
 from softgym_envs.extensions.fitting.reduction import reduce_motion
-from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.robots.base import Robot
-from softgym_envs.surrogate.features import Features
 from softgym_envs.extensions.motion.inertia import (
     LearnedInertia,
     Polynomials,
@@ -22,6 +19,9 @@ from softgym_envs.extensions.motion.inertia import (
     to_entries,
     typical_sizes,
 )
+from softgym_envs.mechanics.solvers.statics import Statics
+from softgym_envs.robots.base import Robot
+from softgym_envs.surrogate.features import Features
 from softgym_envs.surrogate.weight_files import card_of
 
 TESTED = 8

@@ -19,9 +19,9 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from softgym_envs.errors import ConvergenceError
+from softgym_envs.extensions.motion.inertia import root
 from softgym_envs.mechanics.assembly import MassAndDamping
 from softgym_envs.mechanics.solvers.schemes import StartingAcceleration
-from softgym_envs.extensions.motion.inertia import root
 
 if TYPE_CHECKING:
     from softgym_envs.mechanics.solvers.statics import Statics

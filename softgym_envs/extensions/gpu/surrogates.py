@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 
 from softgym_envs.backends.surrogate import TOLERANCE
+from softgym_envs.extensions.fitting.torch_potential import PotentialEnsemble
 from softgym_envs.surrogate.domain import EDGE, SLACK
 from softgym_envs.surrogate.model import SurrogateModel
 from softgym_envs.surrogate.potential.model import Model
-from softgym_envs.extensions.fitting.torch_potential import PotentialEnsemble
 
 #: A quarter of an actuator's range, the unit of steps and tolerances of searches, in scaled displacements.
 SPAN = 0.5

@@ -14,9 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign, unknown_name
+from softgym_envs.extensions.beams.prism import RoundedPrism
 from softgym_envs.extensions.grasping.robots.contact_aided_finger import HELD, ContactAidedFinger
 from softgym_envs.mechanics.contact.contact import Contacts, ContactSettings
-from softgym_envs.mechanics.contact.obstacles import IDENTITY, Obstacle, Plane, RoundedPrism, Sphere
+from softgym_envs.mechanics.contact.obstacles import IDENTITY, Obstacle, Plane, Sphere
 from softgym_envs.mechanics.solvers.statics import Statics
 
 KINDS = ("plane", "hexagon", "horizontal_hexagon", "sphere")

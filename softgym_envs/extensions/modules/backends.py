@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from softgym_envs.backends.fem import FEMBackend
-from softgym_envs.extensions.paths.hybrid import PathHybridBackend
 from softgym_envs.extensions.modules.modular_arm import ModularArm
+from softgym_envs.extensions.paths.hybrid import PathHybridBackend
 
 
 class ModularBackend(FEMBackend):

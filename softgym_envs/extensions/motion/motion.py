@@ -1,4 +1,4 @@
-"""Motion of a learned condensed model in time: its energy, and the learned inertia of `softgym_envs.extensions.motion.inertia`.
+"""Motion of a learned condensed model in time: its energy, and the learned inertia of the module `inertia`.
 
 The coordinates are the constraint values of the body (displacements ``q`` of its actuators and positions ``e`` of its
 effectors) and the amplitudes ``r`` of its inner modes. With the equilibrium effectors ``x(q)`` and ``z = e - x(q)``,
@@ -14,16 +14,15 @@ two places and the squared periods ``P`` halfway between them, which change far 
 from __future__ import annotations
 
 from dataclasses import dataclass
-
 from pathlib import Path
 
 import numpy as np
 
 from softgym_envs.backends.batch import BatchState, Rows
 from softgym_envs.backends.time_steps import TimeSteps
+from softgym_envs.extensions.motion.inertia import half_stiffness, read_inertia
 from softgym_envs.mechanics.condensation import CondensedModel
 from softgym_envs.mechanics.solvers.complementarity import solve_rows
-from softgym_envs.extensions.motion.inertia import half_stiffness, read_inertia
 from softgym_envs.surrogate.model import Context, SurrogateModel
 
 ITERATIONS = 20

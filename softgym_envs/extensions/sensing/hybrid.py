@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from softgym_envs.extensions.paths.hybrid import PathHybridBackend
 from softgym_envs.backends.surrogate import SurrogateBackend
+from softgym_envs.extensions.paths.hybrid import PathHybridBackend
 from softgym_envs.extensions.sensing.sensorized_finger import SensorizedFinger
 
 

@@ -10,6 +10,7 @@ import pytest
 from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.extensions.beams.beam import Beam, Section
+from softgym_envs.extensions.beams.prism import RoundedPrism
 from softgym_envs.extensions.beams.solver.batch import BeamBatch, BeamStates
 from softgym_envs.extensions.beams.solver.contact import FEW
 from softgym_envs.extensions.beams.solver.equations import Step, assemble, point_strains
@@ -17,7 +18,7 @@ from softgym_envs.extensions.beams.solver.frames import move
 from softgym_envs.extensions.beams.solver.motion import anchors_of
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.contact.contact import ContactSettings
-from softgym_envs.mechanics.contact.obstacles import Cylinder, MeshObstacle, Plane, RoundedPrism, Sphere
+from softgym_envs.mechanics.contact.obstacles import Cylinder, MeshObstacle, Plane, Sphere
 from softgym_envs.mechanics.solvers.dynamics import Dynamics
 from softgym_envs.mechanics.solvers.statics import Statics
 from tests.verification.walkers import H, compared_walk, dynamics, ground, mover, remaining, trot, walker

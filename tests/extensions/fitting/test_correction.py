@@ -12,11 +12,11 @@ from softgym_envs import make_robot
 from softgym_envs.config import load_config, shipped_configs
 from softgym_envs.errors import DataError
 from softgym_envs.extensions.fitting.correction import HIGHEST_ORDER, LOWEST_ORDER, fit_correction, order_of
+from softgym_envs.extensions.fitting.torch_potential import TorchModel
 from softgym_envs.extensions.fitting.training import FitConfig
 from softgym_envs.extensions.gpu.surrogates import TorchBatch
 from softgym_envs.surrogate.correction import EffortCorrection
 from softgym_envs.surrogate.potential.model import Model
-from softgym_envs.extensions.fitting.torch_potential import TorchModel
 from softgym_envs.surrogate.pretrained import pretrained_folder
 from tests.helpers import random_states, untrained_potential
 

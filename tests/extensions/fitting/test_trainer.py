@@ -10,11 +10,11 @@ from softgym_envs import make_robot
 from softgym_envs.extensions.fitting.data.states import States
 from softgym_envs.extensions.fitting.potential import make_targets, potential_loss, unstack_members
 from softgym_envs.extensions.fitting.predictions import reached
+from softgym_envs.extensions.fitting.torch_potential import PotentialNet
 from softgym_envs.extensions.fitting.trainer import Trainer
 from softgym_envs.extensions.networks import thesis
 from softgym_envs.extensions.networks.perceptron import perceptron
 from softgym_envs.surrogate.potential.model import Model
-from softgym_envs.extensions.fitting.torch_potential import PotentialNet
 from softgym_envs.surrogate.pretrained import pretrained_model
 from tests.helpers import random_states
 

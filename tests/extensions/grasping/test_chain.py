@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from softgym_envs.errors import WeightsError
+from softgym_envs.extensions.beams.contact_law import gap_of, table_of
+from softgym_envs.extensions.beams.prism import RoundedPrism
 from softgym_envs.extensions.grasping.chain import closings
 from softgym_envs.extensions.grasping.chain.body import KINDS, FingerChain
 from softgym_envs.extensions.grasping.chain.closings import Closings
@@ -11,8 +13,7 @@ from softgym_envs.extensions.grasping.chain.contact import ChainBatch, changes_a
 from softgym_envs.extensions.grasping.chain.kernels import assemble, bow, points_near, segment, turns
 from softgym_envs.extensions.grasping.chain.model import ChainModel, load_chain, save_chain
 from softgym_envs.extensions.grasping.chain.segments import OUTPUTS
-from softgym_envs.mechanics.contact.compiled import gap_of, table_of
-from softgym_envs.mechanics.contact.obstacles import Cylinder, Plane, RoundedPrism, Sphere
+from softgym_envs.mechanics.contact.obstacles import Cylinder, Plane, Sphere
 from softgym_envs.mechanics.solvers.complementarity import solve_complementarity
 from softgym_envs.robots.registry import make_robot
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from softgym_envs.extensions.paths import hybrid
 from softgym_envs.backends.registry import make_backend
 from softgym_envs.errors import InfeasibleDesign, WeightsError
 from softgym_envs.extensions.grasping.backends.chain import ChainBackend, HybridChainBackend
+from softgym_envs.extensions.paths import hybrid
 from softgym_envs.mechanics.contact.obstacles import Sphere
 from softgym_envs.robots.registry import make_robot
 from softgym_envs.surrogate.domain import OUTSIDE, SELF_CONTACT

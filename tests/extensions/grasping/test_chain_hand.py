@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from softgym_envs.extensions.paths import hybrid
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.backends.registry import make_backend
 from softgym_envs.errors import InfeasibleDesign
@@ -17,6 +16,7 @@ from softgym_envs.extensions.grasping.backends.chain_hand import (
     HandMemory,
     HybridHandBackend,
 )
+from softgym_envs.extensions.paths import hybrid
 from softgym_envs.robots.registry import make_robot
 from softgym_envs.surrogate.domain import OUTSIDE
 

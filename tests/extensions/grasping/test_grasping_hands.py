@@ -6,10 +6,11 @@ import pytest
 from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.errors import InfeasibleDesign
+from softgym_envs.extensions.beams.prism import RoundedPrism
 from softgym_envs.extensions.grasping.grasps import KINDS
 from softgym_envs.extensions.grasping.robots.carried_objects import CARRIED
 from softgym_envs.extensions.grasping.robots.grasping_hands import ON_TABLE
-from softgym_envs.mechanics.contact.obstacles import Plane, RoundedPrism, Sphere
+from softgym_envs.mechanics.contact.obstacles import Plane, Sphere
 
 COARSE = {"element": "linear", "mesh_size": 0.015}
 

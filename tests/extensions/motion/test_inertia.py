@@ -11,8 +11,6 @@ from scipy.linalg import eigh
 from softgym_envs.errors import WeightsError
 from softgym_envs.extensions.fitting.inertia_training import fit_inertia
 from softgym_envs.extensions.fitting.reduction import reduce_motion
-from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.robots.registry import make_robot
 from softgym_envs.extensions.motion.inertia import (
     FILE,
     LearnedInertia,
@@ -23,6 +21,8 @@ from softgym_envs.extensions.motion.inertia import (
     to_entries,
     write_inertia,
 )
+from softgym_envs.mechanics.solvers.statics import Statics
+from softgym_envs.robots.registry import make_robot
 from softgym_envs.surrogate.pretrained import pretrained_folder
 
 

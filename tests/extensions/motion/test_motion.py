@@ -10,11 +10,11 @@ import softgym_envs  # noqa: F401  registers the environments
 from softgym_envs.agents.config import EnvironmentConfig
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.backends.surrogate import SurrogateBackend, SurrogateBatch
-from softgym_envs.extensions.motion.motion import SurrogateMotion
 from softgym_envs.backends.time_steps import TimeSteps
 from softgym_envs.errors import WeightsError
-from softgym_envs.robots.registry import make_robot
 from softgym_envs.extensions.motion.inertia import half_stiffness
+from softgym_envs.extensions.motion.motion import SurrogateMotion
+from softgym_envs.robots.registry import make_robot
 from softgym_envs.surrogate.pretrained import pretrained_folder, pretrained_model
 
 SOFT = {"young_modulus": 1.0e6}

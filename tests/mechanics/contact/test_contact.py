@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from softgym_envs.errors import ConvergenceError
+from softgym_envs.extensions.beams.prism import RoundedPrism
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.contact.contact import ContactSettings, ContactState
 from softgym_envs.mechanics.contact.law import barrier, friction, friction_energy
-from softgym_envs.mechanics.contact.obstacles import Plane, RoundedPrism, Sphere
+from softgym_envs.mechanics.contact.obstacles import Plane, Sphere
 from softgym_envs.mechanics.solvers.dynamics import Dynamics
 from softgym_envs.mechanics.solvers.prediction import Bend
 from softgym_envs.mechanics.solvers.statics import Statics

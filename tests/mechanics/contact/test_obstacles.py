@@ -11,12 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from softgym_envs.extensions.beams.prism import RoundedPrism
 from softgym_envs.mechanics.contact.obstacles import (
     KINDS,
     Cylinder,
     MeshObstacle,
     Plane,
-    RoundedPrism,
     Sphere,
     obstacle_from,
 )

@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from softgym_envs.extensions.beams.prism import RoundedPrism
 from softgym_envs.extensions.beams.skins import box_skin
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.contact.contact import ContactSettings, ContactState
-from softgym_envs.mechanics.contact.obstacles import MeshObstacle, Plane, RoundedPrism
+from softgym_envs.mechanics.contact.obstacles import MeshObstacle, Plane
 from softgym_envs.mechanics.elements.rigid import box_inertia
 from softgym_envs.mechanics.elements.tetrahedra import boundary_triangles
 from softgym_envs.mechanics.solvers.statics import Statics

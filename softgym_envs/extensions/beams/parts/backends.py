@@ -11,10 +11,10 @@ import numpy as np
 
 from softgym_envs.backends.backend import PointForce, State
 from softgym_envs.backends.fem import FEMBackend
-from softgym_envs.extensions.paths.hybrid import PathHybridBackend
 from softgym_envs.designs import Design
 from softgym_envs.extensions.beams.parts.trust import judge
 from softgym_envs.extensions.beams.parts.weights import of_learned_parts
+from softgym_envs.extensions.paths.hybrid import PathHybridBackend
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.dynamics import Motion
 from softgym_envs.mechanics.solvers.equilibrium import SATURATED, Equilibrium

@@ -14,6 +14,8 @@ import numpy as np
 from numba import types
 from numba.extending import overload
 
+from softgym_envs.extensions.beams.beam_kernels import add_forces, interpolate, pull_back
+from softgym_envs.extensions.beams.contact_law import quick_gap, stretch_of, touch_point
 from softgym_envs.extensions.beams.solver.block_cholesky import solve_lower, solve_upper
 from softgym_envs.extensions.beams.solver.contact import has_failed, point_at, spread_of
 from softgym_envs.extensions.beams.solver.equations import (
@@ -28,8 +30,6 @@ from softgym_envs.extensions.beams.solver.frames import reduce_forces, rows_move
 from softgym_envs.extensions.beams.solver.motion import Stepping, copy_state, march_rows, restore_state
 from softgym_envs.extensions.beams.solver.newton import factorise_tangent, invert_driven
 from softgym_envs.mechanics.compilation import FAST, njit
-from softgym_envs.mechanics.contact.compiled import quick_gap, stretch_of, touch_point
-from softgym_envs.mechanics.elements.beam_kernels import add_forces, interpolate, pull_back
 
 
 class Adjoint(NamedTuple):

@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from softgym_envs.extensions.beams.contact_law import PointTouch, make_touch, quick_gap, touch_point
 from softgym_envs.extensions.beams.solver.block_cholesky import SIZE, copy_values
 from softgym_envs.extensions.beams.solver.points import ContactPoints
 from softgym_envs.mechanics.compilation import FAST, njit
-from softgym_envs.mechanics.contact.compiled import PointTouch, make_touch, quick_gap, touch_point
 
 MAX_SLIDING = 160
 """Points that may slide at once; the general solver takes over beyond it."""

@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from softgym_envs.extensions.beams.contact_law import quick_gap
 from softgym_envs.extensions.beams.solver.batch import body_of, stacked
 from softgym_envs.extensions.beams.solver.body import FIXED, BeamBody, beam_body, reason_for_general
 from softgym_envs.extensions.beams.solver.contact import catch_up, has_failed, point_at
 from softgym_envs.extensions.beams.solver.equations import Step, assemble, point_strains
 from softgym_envs.mechanics.compilation import njit
-from softgym_envs.mechanics.contact.compiled import quick_gap
 
 if TYPE_CHECKING:  # kernels do not depend on it, see `compilation`
     from softgym_envs.mechanics.model import MechanicalModel

@@ -10,12 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from softgym_envs.extensions.beams.solver.block_cholesky import SIZE
-from softgym_envs.extensions.beams.solver.body import DIRECTOR, FIXED, ORIGIN, BeamBody
-from softgym_envs.extensions.beams.solver.contact import Slides, add_contact, forget_near, hold_slides, make_slides
-from softgym_envs.extensions.beams.solver.frames import add_curvature, reduce_forces
-from softgym_envs.mechanics.compilation import FAST, njit
-from softgym_envs.mechanics.elements.beam_kernels import (
+from softgym_envs.extensions.beams.beam_kernels import (
     Work,
     add_forces,
     add_turned,
@@ -27,6 +22,11 @@ from softgym_envs.mechanics.elements.beam_kernels import (
     spin_columns,
     strains,
 )
+from softgym_envs.extensions.beams.solver.block_cholesky import SIZE
+from softgym_envs.extensions.beams.solver.body import DIRECTOR, FIXED, ORIGIN, BeamBody
+from softgym_envs.extensions.beams.solver.contact import Slides, add_contact, forget_near, hold_slides, make_slides
+from softgym_envs.extensions.beams.solver.frames import add_curvature, reduce_forces
+from softgym_envs.mechanics.compilation import FAST, njit
 
 
 class Step(NamedTuple):

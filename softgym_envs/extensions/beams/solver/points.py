@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from softgym_envs.mechanics.contact.compiled import table_of
+from softgym_envs.extensions.beams.contact_law import table_of
 from softgym_envs.mechanics.contact.obstacles import MeshObstacle, Obstacle
 
 if TYPE_CHECKING:  # kernels do not depend on them, see `compilation`

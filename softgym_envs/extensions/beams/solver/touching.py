@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from softgym_envs.extensions.beams.contact_law import add_friction, quick_gap, touch_point
 from softgym_envs.extensions.beams.solver.block_cholesky import SIZE, copy_values
 from softgym_envs.extensions.beams.solver.contact import (
     find_near,
@@ -41,7 +42,6 @@ from softgym_envs.extensions.beams.solver.response import (
     soften,
 )
 from softgym_envs.mechanics.compilation import njit
-from softgym_envs.mechanics.contact.compiled import add_friction, quick_gap, touch_point
 
 MAX_ITERATIONS = 30
 """Largest number of steps of the whole body."""

@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from softgym_envs.backends.backend import Backend, State, check_numbers, refuse_force
-from softgym_envs.extensions.paths.hybrid import PathHybridBackend
 from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
 from softgym_envs.extensions.grasping.chain.contact import ChainBatch, ChainContacts, Memory, rows_for
 from softgym_envs.extensions.grasping.chain.model import ChainModel, load_chain
 from softgym_envs.extensions.grasping.chain.rows import contact_rows
 from softgym_envs.extensions.grasping.robots.contact_aided_finger import ContactAidedFinger
+from softgym_envs.extensions.paths.hybrid import PathHybridBackend
 from softgym_envs.mechanics.condensation import CondensedModel, Row, point_rows
 from softgym_envs.mechanics.contact.contact import Contacts
 from softgym_envs.surrogate.domain import SELF_CONTACT, SOFT

@@ -14,9 +14,10 @@ from typing import NamedTuple
 import numpy as np
 
 from softgym_envs.backends.backend import Backend, State, check_numbers, refuse_force
-from softgym_envs.extensions.paths.hybrid import PathHybridBackend
 from softgym_envs.designs import Design
 from softgym_envs.errors import ConvergenceError, InfeasibleDesign
+from softgym_envs.extensions.beams.contact_law import table_of
+from softgym_envs.extensions.beams.prism import RoundedPrism
 from softgym_envs.extensions.beams.skins import box_skin
 from softgym_envs.extensions.grasping.chain.contact import FOLDED, STICK, STIFFNESS
 from softgym_envs.extensions.grasping.chain.equilibrium import clearances, touching
@@ -38,10 +39,10 @@ from softgym_envs.extensions.grasping.robots.grasping_hands import (
     TABLE_STIFFNESS,
     ContactAidedGripper,
 )
+from softgym_envs.extensions.paths.hybrid import PathHybridBackend
 from softgym_envs.mechanics.condensation import CondensedModel, Row, point_rows
-from softgym_envs.mechanics.contact.compiled import table_of
 from softgym_envs.mechanics.contact.contact import Contacts
-from softgym_envs.mechanics.contact.obstacles import Plane, RoundedPrism
+from softgym_envs.mechanics.contact.obstacles import Plane
 from softgym_envs.mechanics.contact.surface import surface_of
 from softgym_envs.surrogate.domain import SELF_CONTACT
 

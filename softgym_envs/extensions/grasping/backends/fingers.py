@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from softgym_envs.backends.fem import FEMBackend
-from softgym_envs.extensions.paths.hybrid import PathHybridBackend
 from softgym_envs.designs import Design
 from softgym_envs.errors import WeightsError
 from softgym_envs.extensions.grasping.held_fingers import CABLES, HeldFingers, LearnedFinger
 from softgym_envs.extensions.grasping.robots.composed_gripper import ComposedGripper
+from softgym_envs.extensions.paths.hybrid import PathHybridBackend
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.equilibrium import Equilibrium
 from softgym_envs.mechanics.solvers.statics import Statics

@@ -8,10 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from softgym_envs.extensions.beams.contact_law import PARAMETERS, PLANE, table_of
+from softgym_envs.extensions.beams.prism import RoundedPrism
 from softgym_envs.extensions.grasping.chain.equilibrium import advance, clearances, condense, touching
 from softgym_envs.extensions.grasping.chain.model import PreparedChains, carried_points
-from softgym_envs.mechanics.contact.compiled import PARAMETERS, PLANE, table_of
-from softgym_envs.mechanics.contact.obstacles import Cylinder, Obstacle, Plane, RoundedPrism
+from softgym_envs.mechanics.contact.obstacles import Cylinder, Obstacle, Plane
 
 DISTANCE = 5.0e-4
 """Gap at which contact forces vanish [m]."""

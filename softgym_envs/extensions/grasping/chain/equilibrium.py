@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from softgym_envs.extensions.beams.contact_law import gap_of
 from softgym_envs.extensions.grasping.chain.kernels import (
     MAX_ITERATIONS,
     MAX_STEP,
@@ -19,7 +20,6 @@ from softgym_envs.extensions.grasping.chain.kernels import (
     turns,
 )
 from softgym_envs.mechanics.compilation import njit
-from softgym_envs.mechanics.contact.compiled import gap_of
 
 TOLERANCE = 1e-9
 """A search ends when its last step moves no node further than this [m]."""

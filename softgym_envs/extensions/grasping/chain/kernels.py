@@ -14,8 +14,8 @@ import math
 
 import numpy as np
 
+from softgym_envs.extensions.beams.contact_law import gap_of, make_touch, quick_gap, touch_point
 from softgym_envs.mechanics.compilation import njit
-from softgym_envs.mechanics.contact.compiled import gap_of, make_touch, quick_gap, touch_point
 
 MAX_STEP = 0.004
 """Largest displacement of a node in one Newton step [m]; half of the thinnest allowed obstacle."""

@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from softgym_envs.extensions.beams.contact_law import gap_of
 from softgym_envs.extensions.grasping.chain.contact import ChainBatch
 from softgym_envs.extensions.grasping.chain.equilibrium import drive_direction
 from softgym_envs.extensions.grasping.chain.kernels import assemble, skin_point, touch, turns
 from softgym_envs.mechanics.compilation import njit
-from softgym_envs.mechanics.contact.compiled import gap_of
 
 
 class ContactRows(NamedTuple):

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from softgym_envs.extensions.beams.prism import RoundedPrism
 from softgym_envs.extensions.beams.skins import box_skin, revolved_skin
-from softgym_envs.mechanics.contact.obstacles import Obstacle, RoundedPrism, Sphere
+from softgym_envs.mechanics.contact.obstacles import Obstacle, Sphere
 from softgym_envs.mechanics.elements.rigid import box_inertia, sphere_inertia
 from softgym_envs.mechanics.skins import Skin
 

@@ -13,12 +13,13 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.designs import DesignVariable
+from softgym_envs.extensions.beams.prism import RoundedPrism
 from softgym_envs.extensions.beams.skins import box_skin
 from softgym_envs.extensions.grasping.robots.grippers import STRAIGHT, TURNED, FingerRobot, ThreeFingerGripper
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
-from softgym_envs.mechanics.contact.obstacles import Obstacle, RoundedPrism
+from softgym_envs.mechanics.contact.obstacles import Obstacle
 from softgym_envs.mechanics.elements.rigid import box_inertia
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.capabilities import Learning

@@ -8,8 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from softgym_envs.extensions.beams.prism import RoundedPrism, prism_geometry
 from softgym_envs.mechanics.compilation import njit
-from softgym_envs.mechanics.contact.obstacles import Cylinder, Obstacle, Plane, RoundedPrism, Sphere, prism_geometry
+from softgym_envs.mechanics.contact.obstacles import Cylinder, Obstacle, Plane, Sphere
 
 PLANE, ROUND, PRISM = 0, 1, 2
 """Kinds of obstacles. A row of parameters holds: kind, friction, radius, half height, number of edges, centre (3),
