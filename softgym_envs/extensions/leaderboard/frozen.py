@@ -23,6 +23,7 @@ from softgym_envs.extensions.leaderboard.problem import (
     JudgedScore,
     goal_key,
 )
+from softgym_envs.extensions.walkers.robots.mobile import mobile
 from softgym_envs.storage import atomic_write, read_json
 from softgym_envs.surrogate.pretrained import pretrained_folder
 
@@ -124,7 +125,7 @@ def frozen_parts(definition: BenchmarkProblem, goals: Mapping[str, np.ndarray]) 
     if task.horizon > 1:
         physics["lookahead"] = task.lookahead
     if definition.track == "E":
-        physics["gait"] = np.round(robot.reference_gait() / robot.rates, 6).tolist()
+        physics["gait"] = np.round(mobile(robot).reference_gait() / robot.rates, 6).tolist()
     parts = {
         "definition": _hash(definition.model_dump(mode="json", exclude={"title"}, exclude_unset=True)),
         "physics": _hash(physics),
