@@ -10,12 +10,13 @@ from scipy.linalg import expm
 from scipy.sparse import coo_matrix
 from scipy.spatial.transform import Rotation
 
+from softgym_envs.extensions.beams import beam
 from softgym_envs.extensions.beams.beam import Beam, Section, are_folded
 from softgym_envs.extensions.modules import superelement
 from softgym_envs.extensions.modules.superelement import Superelement
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.point import Point
-from softgym_envs.mechanics.elements import averaged, beams, quadratic, tetrahedra
+from softgym_envs.mechanics.elements import averaged, quadratic, tetrahedra
 from softgym_envs.mechanics.elements.averaged import AveragedTetrahedra
 from softgym_envs.mechanics.elements.block import ElementBlock, StrainRates
 from softgym_envs.mechanics.elements.quadratic import QuadraticTetrahedra, add_midside_nodes, split_triangles
@@ -28,7 +29,7 @@ from softgym_envs.mechanics.solvers.statics import Statics
 
 KINDS = {
     cls
-    for module in (averaged, beams, quadratic, superelement, tetrahedra)
+    for module in (averaged, beam, quadratic, superelement, tetrahedra)
     for cls in vars(module).values()
     if inspect.isclass(cls) and issubclass(cls, ElementBlock) and not inspect.isabstract(cls)
 }
