@@ -30,6 +30,7 @@ PACKAGES = {
     "softgym_envs.extensions.gpu": "Extension: environments on tensors",
     "softgym_envs.extensions.grasping": "Extension: grasping",
     "softgym_envs.extensions.hardware": "Extension: physical robots",
+    "softgym_envs.extensions.learners": "Extension: learners",
     "softgym_envs.extensions.modules": "Extension: compliant modules",
     "softgym_envs.extensions.report": "Extension: report of a study",
     "softgym_envs.extensions.sensing": "Extension: sensing",

@@ -37,7 +37,8 @@ LAYERS = [
     # Extensions: no core package imports one. Those of one layer do not know each other.
     {"softgym_envs.extensions.paths"},
     {"softgym_envs.extensions", "softgym_envs.extensions.beams", "softgym_envs.extensions.checks"}
-    | {"softgym_envs.extensions.motion", "softgym_envs.extensions.postgres", "softgym_envs.extensions.recordings"}
+    | {"softgym_envs.extensions.learners", "softgym_envs.extensions.motion"}
+    | {"softgym_envs.extensions.postgres", "softgym_envs.extensions.recordings"}
     | {"softgym_envs.extensions.sweeps"},
     {"softgym_envs.extensions.fitting", "softgym_envs.extensions.report"},
     {"softgym_envs.extensions.design"},
@@ -46,7 +47,6 @@ LAYERS = [
         "softgym_envs.extensions.grasping",
         "softgym_envs.extensions.hardware",
         "softgym_envs.extensions.hybrid",
-        "softgym_envs.extensions.learners",
         "softgym_envs.extensions.measured",
         "softgym_envs.extensions.networks",
         "softgym_envs.extensions.sensing",

@@ -26,6 +26,7 @@ PACKAGES = [
     "softgym_envs.extensions.grasping",
     "softgym_envs.extensions.hardware",
     "softgym_envs.extensions.leaderboard",
+    "softgym_envs.extensions.learners",
     "softgym_envs.extensions.modules",
     "softgym_envs.extensions.report",
     "softgym_envs.extensions.sensing",

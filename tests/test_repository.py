@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from softgym_envs import extras
-from softgym_envs.cli.doctor import examine
+from softgym_envs.extensions.checks.doctor import examine
 from softgym_envs.version import __version__
 from tests.test_readme import ROOT
 

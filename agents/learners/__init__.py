@@ -7,7 +7,6 @@ LEARNERS = Registry(
     {
         "sac": "softgym_envs.agents.learners.sac:SACLearner",
         "ppo": "softgym_envs.agents.learners.ppo:PPOLearner",
-        "analytic": "softgym_envs.agents.learners.analytic:AnalyticLearner",
     },
     base="softgym_envs.agents.learners.base:Learner",
     group="softgym_envs.learners",

@@ -44,10 +44,6 @@ SECTIONS = {
     "Configurations": {
         "configs": "configs:configs",
     },
-    "Development": {
-        "doctor": "doctor:doctor",
-        "bench": "bench:bench",
-    },
 }
 """Title in the help -> verb -> its place in `softgym_envs.cli`."""
 

@@ -6,14 +6,12 @@ from softgym_envs._lazy import lazy_exports
 
 if TYPE_CHECKING:
     from softgym_envs.envs.env import SoftRobotEnv as SoftRobotEnv
-    from softgym_envs.envs.goals import GoalObservation as GoalObservation
     from softgym_envs.envs.tasks.base import Task as Task
 
 __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
     {
         "env": ["SoftRobotEnv"],
-        "goals": ["GoalObservation"],
         "tasks.base": ["Task"],
     },
 )

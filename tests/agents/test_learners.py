@@ -7,13 +7,13 @@ import torch
 from softgym_envs.agents.config import TrainConfig
 from softgym_envs.agents.evaluation import evaluate, sample_goals
 from softgym_envs.agents.learners import LEARNERS
-from softgym_envs.agents.learners.analytic import AnalyticLearner
 from softgym_envs.agents.learners.ppo import PPOLearner
 from softgym_envs.agents.policy import Policy, read_tensors, save_policy
 from softgym_envs.agents.residual import BatchQP
 from softgym_envs.agents.training import CHECKPOINT, _restore, train
 from softgym_envs.errors import ConfigError, WeightsError
 from softgym_envs.extensions.deployment.policy_onnx import exported_spaces
+from softgym_envs.extensions.learners.analytic import AnalyticLearner
 from softgym_envs.extensions.learners.cloning import CloningLearner
 from softgym_envs.extensions.learners.evolution import EvolutionConfig, EvolutionLearner
 from softgym_envs.extensions.learners.recurrent import RecurrentConfig, RecurrentLearner

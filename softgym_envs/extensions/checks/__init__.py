@@ -1,1 +1,1 @@
-"""Examination of a robot before work is spent on it: `softgym check`."""
+"""Examination of a robot, of the installation and of speed: `softgym check`, `doctor`, `bench`."""

@@ -17,10 +17,10 @@ from pydantic import Field
 from softgym_envs.agents.baselines import InverseQPAgent
 from softgym_envs.agents.config import TrainConfig
 from softgym_envs.agents.learners.base import Tensors
-from softgym_envs.agents.learners.gradient import GradientLearner
-from softgym_envs.agents.learners.network import GradientConfig
 from softgym_envs.agents.residual import BatchQP
 from softgym_envs.envs.vector_env import SoftRobotVectorEnv
+from softgym_envs.extensions.learners.gradient import GradientLearner
+from softgym_envs.extensions.learners.network import GradientConfig
 
 
 class CloningConfig(GradientConfig):

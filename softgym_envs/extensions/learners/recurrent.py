@@ -17,8 +17,8 @@ from pydantic import Field
 from softgym_envs.agents.baselines import make_baseline
 from softgym_envs.agents.config import TrainConfig
 from softgym_envs.agents.learners.base import Tensors
-from softgym_envs.agents.learners.network import GradientConfig, NetworkLearner
 from softgym_envs.agents.policy import memory_layers, remember
+from softgym_envs.extensions.learners.network import GradientConfig, NetworkLearner
 
 
 class RecurrentConfig(GradientConfig):

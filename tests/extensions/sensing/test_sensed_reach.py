@@ -13,8 +13,8 @@ from softgym_envs import make_robot
 from softgym_envs.agents.baselines import make_baseline
 from softgym_envs.backends.backend import PointForce
 from softgym_envs.backends.fem import FEMBackend
-from softgym_envs.envs.goals import GoalObservation
 from softgym_envs.envs.tasks.registry import make_task
+from softgym_envs.extensions.learners.goals import GoalObservation
 from softgym_envs.mechanics.solvers.statics import Statics
 
 ID = "SoftGym/SensorizedFingerReach-v0"

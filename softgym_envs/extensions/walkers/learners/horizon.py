@@ -21,9 +21,9 @@ import numpy as np
 from pydantic import Field
 
 from softgym_envs.agents.config import TrainConfig
-from softgym_envs.agents.learners.network import NetworkLearner, RateConfig
 from softgym_envs.errors import ConvergenceError
 from softgym_envs.extensions.beams.recorder import recording
+from softgym_envs.extensions.learners.network import NetworkLearner, RateConfig
 from softgym_envs.extensions.walkers.learners.gait import (
     TIGHTNESS,
     check_compiled,

@@ -15,14 +15,14 @@ import numpy as np
 from pydantic import Field
 
 from softgym_envs.agents.config import TrainConfig
-from softgym_envs.agents.learners.gradient import GradientLearner
-from softgym_envs.agents.learners.network import GradientConfig
 from softgym_envs.envs.gradients import StepGradient
 from softgym_envs.envs.vector_env import SoftRobotVectorEnv
+from softgym_envs.extensions.learners.gradient import GradientLearner
+from softgym_envs.extensions.learners.network import GradientConfig
 
 
 class AnalyticConfig(GradientConfig):
-    """Hyperparameters of the analytic policy gradient (`softgym_envs.agents.learners.analytic`)."""
+    """Hyperparameters of the analytic policy gradient (`softgym_envs.extensions.learners.analytic`)."""
 
     slack_pull: float = Field(
         default=0.3, ge=0, description="how strongly commands of slack cables follow the displacement that is reached"

@@ -10,8 +10,8 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 from softgym_envs.agents.config import TrainConfig
-from softgym_envs.agents.learners.network import GradientConfig, NetworkLearner
 from softgym_envs.envs.vector_env import SoftRobotVectorEnv
+from softgym_envs.extensions.learners.network import GradientConfig, NetworkLearner
 
 if TYPE_CHECKING:
     import torch

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from stable_baselines3.common.env_checker import check_env
 
-from softgym_envs.envs import GoalObservation
+from softgym_envs.extensions.learners import GoalObservation
 
 
 @pytest.mark.parametrize("effort", [False, True])
