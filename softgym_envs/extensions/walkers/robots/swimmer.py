@@ -13,9 +13,6 @@ from typing import Any
 import numpy as np
 
 from softgym_envs.designs import DesignSpace, DesignVariable
-from softgym_envs.extensions.beams.beam import Beam, Section
-from softgym_envs.extensions.beams.chamber import Chamber
-from softgym_envs.extensions.beams.skins import tube_skin
 from softgym_envs.extensions.walkers.fluid import slender_drag
 from softgym_envs.extensions.walkers.robots.mobile import MobileRobot
 from softgym_envs.extensions.walkers.robots.tapered import add_chambers, lay_body

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from softgym_envs.extensions.beams.beam import Beam, Section
+from softgym_envs.extensions.beams.chamber import Chamber
+from softgym_envs.extensions.beams.skins import tube_skin
 from softgym_envs.mechanics.builder import ModelBuilder
-from softgym_envs.mechanics.constraints.chamber import Chamber
-from softgym_envs.mechanics.elements.beams import Beam, Section
 from softgym_envs.mechanics.model import MechanicalModel
-from softgym_envs.mechanics.skins import tube_skin
 from softgym_envs.robots.actuator import Actuator
 
 CHAMBER_OFFSET, CHAMBER_RADIUS = 0.55, 0.35
@@ -45,7 +45,7 @@ def lay_body(
         segments: pairs of chambers along it.
         elements: quadratic beam elements of a segment; the tail has as many.
         fixed: whether its first end is clamped.
-        **material: of `ModelBuilder.add_beam`.
+        **material: of `Beam`.
 
     Returns:
         The first rows of its frames, from the first end on, and the radii there [m].
@@ -63,7 +63,7 @@ def lay_body(
         builder.add_frame(origin, axes, fixed=held, fixed_spin=held)
         for origin, held in zip(origins, clamped, strict=True)
     ]
-    builder.add_beam(frames, section=[Section.circle(radius) for radius in radii[1::ORDER]], **material)
+    builder.add_element(Beam, frames, section=[Section.circle(radius) for radius in radii[1::ORDER]], **material)
     return frames, radii
 
 
