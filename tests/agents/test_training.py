@@ -434,6 +434,7 @@ def test_goals_repeat_and_belong_to_the_body():
         "quadruped_walk_winner",
         "quadruped_follow_horizon",
         "quadruped_climb_horizon",
+        "whip_throw_gait",
     ],
 )
 def test_shipped_policies_were_made_by_the_shipped_configs(name):

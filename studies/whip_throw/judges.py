@@ -1,11 +1,13 @@
-"""Which learner judges decides which whip wins? Bodies of the whip under common throws and under their own.
+"""Which learner judges decides which whip wins? The bodies of a study under common throws and under their own.
 
-    python studies/whip_throw/throw.py results/whip_throw
+    softgym codesign --config whip_throw --folder results/whip_throw
+    python studies/whip_throw/judges.py results/whip_throw results/whip_judges
 
-Eleven bodies that spread over the design box, and the baseline. Judges: the common throw; the throw of the baseline; a
-throw by CMA-ES of six numbers (swings, their phase and growth, strokes of both segments, a shift) with 80 motions; a
-throw along gradients from the common one (60 gradients). Ranges are means of six episodes with payloads of 15 to 25 g.
-Everything is kept in the folder; a second call resumes.
+Judges of the bodies of the study: the common throw; the throw of the baseline; a throw of its own along gradients, as in
+the study; for some of them, a throw by CMA-ES of six numbers (swings, their phase and growth, strokes of both segments, a
+shift) with 80 motions. Then baseline, winner and the best body under the common throw, each with three throws of its own,
+which are also tested with four elements per segment and with time steps of 1 ms, and one for heavier payloads. Ranges are
+means of six episodes with payloads of 15 to 25 g. Everything is kept in the folder; a second call resumes.
 """
 
 from __future__ import annotations
@@ -17,18 +19,18 @@ from typing import Any
 
 import numpy as np
 from cmaes import CMA
-from scipy.stats import kendalltau, qmc
+from scipy.stats import kendalltau
 
 from softgym_envs.agents.config import EnvironmentConfig, TrainConfig
 from softgym_envs.agents.evaluation import evaluate
 from softgym_envs.agents.training import train
-from softgym_envs.robots.registry import make_robot
+from softgym_envs.codesign import load_study
 from softgym_envs.runs import provenance
 from softgym_envs.storage import read_json, write_json
 
 ID = "SoftGym/WhipThrow-v0"
 GOALS = np.tile([0.5, 0.0, -0.6], (6, 1))
-BODIES, STEPS, ROLLOUTS, THROW = 11, 1800, 80, 30
+EVOLVED, STEPS, ROLLOUTS, THROW = 6, 1800, 80, 30
 GAIT = {"period": THROW, "periods": 1, "learning_rate": 0.2, "excess": 5.0}
 OTHERS: tuple[dict[str, Any], ...] = (
     {"robot_options": {"elements": 4}},
@@ -96,39 +98,59 @@ def evolve(design: dict[str, float], seed: int = 0) -> tuple[float, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser()
+    parser.add_argument("study", type=Path)
     parser.add_argument("folder", type=Path)
-    folder = parser.parse_args().folder
+    arguments = parser.parse_args()
+    folder: Path = arguments.folder
     folder.mkdir(parents=True, exist_ok=True)
-    place = folder / "bodies.json"
-    data: dict[str, Any] = read_json(place) if place.exists() else {"provenance": provenance(), "bodies": []}
-    space = make_robot("whip").design_space
-    units = 2.0 * qmc.Sobol(len(space), seed=0).random(16)[:BODIES] - 1.0
-    designs = [dict(space.baseline), *(dict(space.from_unit(unit)) for unit in units)]
-    for number, design in enumerate(designs):
-        if number < len(data["bodies"]):
-            continue
-        policy, cpu = gait(folder / f"body_{number}", design)
-        row = {"design": design, "common": reach("gait", design), "gradients": reach(policy, design), "cpu": cpu}
-        data["bodies"].append(row)
+    place = folder / "judges.json"
+    data: dict[str, Any] = read_json(place) if place.exists() else {"provenance": provenance(), "robust": {}}
+    trials = [trial for trial in load_study(arguments.study).trials if trial.state == "complete"]
+    (baseline,) = (trial for trial in trials if trial.origin == "baseline")
+    of_baseline = arguments.study / baseline.controller
+    if "bodies" not in data:
+        data["bodies"] = [
+            {
+                "number": trial.number,
+                "design": trial.design,
+                "common": trial.qp_value,
+                "gradients": trial.score,
+                "cpu": trial.cpu_seconds,
+                "baseline_throw": reach(of_baseline, trial.design),
+            }
+            for trial in trials
+        ]
         write_json(place, data)
-        print(number, row["common"], row["gradients"], cpu, flush=True)
-    for row, design in zip(data["bodies"], designs, strict=True):
-        if "baseline_throw" not in row:
-            row["baseline_throw"] = reach(folder / "body_0" / "policy.safetensors", design)
+    rows = data["bodies"]
+    own = [row["gradients"] for row in rows]
+    winners = {name: int(np.argmax([row[name] for row in rows])) for name in ("common", "baseline_throw", "gradients")}
+    data["tau"] = {name: float(kendalltau([row[name] for row in rows], own)[0]) for name in winners}
+    data["winners"] = {name: rows[k]["number"] for name, k in winners.items()}
+    first = next(k for k, row in enumerate(rows) if row["number"] == baseline.number)
+    for name, k in {"baseline": first, **winners}.items():
+        design = rows[k]["design"]
+        if name in data["robust"]:
+            continue
+        paths = [gait(folder / f"{name}_{seed}", design, seed)[0] for seed in range(3)]
+        finer, shorter, heavier = OTHERS
+        data["robust"][name] = {
+            "number": rows[k]["number"],
+            "gradients": [reach(path, design) for path in paths],
+            "finer": [reach(path, design, **finer) for path in paths],
+            "shorter": [reach(path, design, **shorter) for path in paths],
+            "heavier": reach(gait(folder / f"{name}_heavier", design, **heavier)[0], design, **heavier),
+        }
+        write_json(place, data)
+        print(name, data["robust"][name], flush=True)
+    chosen = list(dict.fromkeys([first, *winners.values(), *range(len(rows))]))[:EVOLVED]
+    for k in chosen:
+        if "evolution" not in rows[k]:
+            rows[k]["evolution"], rows[k]["evolution_cpu"] = evolve(rows[k]["design"])
             write_json(place, data)
-    for row, design in zip(data["bodies"], designs, strict=True):
-        if "evolution" not in row:
-            row["evolution"], row["evolution_cpu"] = evolve(design)
-            write_json(place, data)
-            print("cma", row["evolution"], row["evolution_cpu"], flush=True)
-    judged = {name: [row[name] for row in data["bodies"]] for name in ("common", "baseline_throw", "evolution", "gradients")}
-    data["tau"] = {name: float(kendalltau(values, judged["gradients"])[0]) for name, values in judged.items()}
-    data["winners"] = {name: int(np.argmax(values)) for name, values in judged.items()}
-    order = [int(k) for k in np.argsort(judged["gradients"])[::-1]]
-    shown = list(dict.fromkeys([0, *data["winners"].values(), *order[:2], *order[-2:]]))
-    if "table" not in data:
-        paths = {k: folder / f"body_{k}" / "policy.safetensors" for k in shown}
-        data["table"] = {"bodies": shown, "ranges": [[reach(paths[g], designs[b]) for b in shown] for g in shown]}
+            print("CMA-ES", rows[k]["number"], rows[k]["evolution"], rows[k]["evolution_cpu"], flush=True)
+    data["tau"]["evolution"] = float(
+        kendalltau([rows[k]["evolution"] for k in chosen], [rows[k]["gradients"] for k in chosen])[0]
+    )
     write_json(place, data)
 
 
