@@ -50,7 +50,7 @@ def predict_within(
     """
     limit = whole.goal_tolerance if tolerance is None else tolerance
     error, uncertainty = np.full((2, len(states)), np.nan)
-    trusted = np.zeros(len(states), dtype=bool)
+    trusted, slack = np.zeros((2, len(states)), dtype=bool)
     backend = make_backend("surrogate", whole, weights=folder)
     for body in np.unique(states.body):
         rows = np.flatnonzero(states.body == body)
@@ -63,9 +63,10 @@ def predict_within(
                 continue
             error[row] = np.linalg.norm(found.effector.ravel()[:3] - states.effector[row, :3])
             uncertainty[row] = found.uncertainty
+            slack[row] = (found.slack == states.slack[row]).all()
             trusted[row] = not found.distrust & ~SPREAD and found.uncertainty <= limit
     kept = np.isfinite(uncertainty) & states.found
-    return Predictions(error, uncertainty, uncertainty, trusted, np.ones(len(states)), kept)
+    return Predictions(error, uncertainty, uncertainty, trusted, np.ones(len(states)), kept, slack)
 
 
 def calibrate_within(
