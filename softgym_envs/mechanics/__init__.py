@@ -10,7 +10,6 @@ if TYPE_CHECKING:
     from softgym_envs.mechanics.constraints.bond import Bond as Bond
     from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints as EmbeddedPoints
     from softgym_envs.mechanics.constraints.point import Point as Point
-    from softgym_envs.mechanics.constraints.slide import Slide as Slide
     from softgym_envs.mechanics.contact.obstacles import Cylinder as Cylinder
     from softgym_envs.mechanics.contact.obstacles import MeshObstacle as MeshObstacle
     from softgym_envs.mechanics.contact.obstacles import Plane as Plane
@@ -29,7 +28,6 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "constraints.bond": ["Bond"],
         "constraints.embedding": ["EmbeddedPoints"],
         "constraints.point": ["Point"],
-        "constraints.slide": ["Slide"],
         "contact.obstacles": ["Cylinder", "MeshObstacle", "Plane", "Sphere"],
         "io": ["read_mesh"],
         "mesh_checks": ["merge_nodes"],

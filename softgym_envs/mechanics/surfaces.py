@@ -10,10 +10,9 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from softgym_envs.errors import ImpossibleState, InfeasibleDesign
+from softgym_envs.errors import ImpossibleState
 from softgym_envs.mechanics.compilation import njit
 from softgym_envs.mechanics.constraints.cavity import Cavity, SealedAir, enclosed_volume
-from softgym_envs.mechanics.constraints.constraint import Constraint
 from softgym_envs.mechanics.elements.gas import EnclosedGas
 from softgym_envs.mechanics.elements.quadratic import split_triangles
 from softgym_envs.mechanics.elements.tetrahedra import boundary_triangles
@@ -442,22 +441,3 @@ def _no_slivers(nodes: np.ndarray, tetrahedra: np.ndarray) -> np.ndarray:
     edges = nodes[tetrahedra[:, 1:]] - nodes[tetrahedra[:, :1]]
     longest = np.linalg.norm(edges, axis=2).max(axis=1)
     return np.linalg.det(edges) > 0.03 * longest**3
-
-
-def check_cavities(cavities: Iterable[Constraint], x: np.ndarray) -> None:
-    """Check that no cavity closes: without self-contact, its walls then pass through each other.
-
-    Args:
-        cavities: constraints, of which those without a cavity are left out.
-        x: rows of a state [m], shape (n, 3).
-
-    Raises:
-        InfeasibleDesign: if the surface of a cavity crosses itself.
-    """
-    for constraint in cavities:
-        cavity = constraint.cavity if isinstance(constraint, SealedAir) else constraint
-        if isinstance(cavity, Cavity) and (place := self_intersection(x, cavity.flat_triangles)) is not None:
-            raise InfeasibleDesign(
-                f"the walls of '{cavity.name}' pass through each other near {np.round(place, 4).tolist()} m, because "
-                "they do not touch each other in this model"
-            )

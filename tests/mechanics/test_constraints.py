@@ -15,6 +15,7 @@ from softgym_envs.extensions.beams.chamber import Chamber
 from softgym_envs.extensions.beams.pose import Pose
 from softgym_envs.extensions.beams.rods import add_rod
 from softgym_envs.extensions.beams.servo import Servo
+from softgym_envs.extensions.beams.slide import Slide
 from softgym_envs.mechanics import ModelBuilder, Statics, constraints
 from softgym_envs.mechanics.constraints.averaging import averaged_points
 from softgym_envs.mechanics.constraints.bond import Bond
@@ -23,7 +24,6 @@ from softgym_envs.mechanics.constraints.cavity import Cavity, SealedAir, enclose
 from softgym_envs.mechanics.constraints.constraint import Constraint
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
-from softgym_envs.mechanics.constraints.slide import Slide
 from softgym_envs.mechanics.elements.quadratic import add_midside_nodes, quadratic_triangles, split_triangles
 from softgym_envs.mechanics.frames import frame_rows
 

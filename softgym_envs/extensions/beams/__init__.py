@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from softgym_envs.extensions.beams.prism import RoundedPrism as RoundedPrism
     from softgym_envs.extensions.beams.rods import add_rod as add_rod
     from softgym_envs.extensions.beams.servo import Servo as Servo
+    from softgym_envs.extensions.beams.slide import Slide as Slide
 
 __getattr__, __dir__, __all__ = lazy_exports(
     __name__,
@@ -20,5 +21,6 @@ __getattr__, __dir__, __all__ = lazy_exports(
         "prism": ["RoundedPrism"],
         "rods": ["add_rod"],
         "servo": ["Servo"],
+        "slide": ["Slide"],
     },
 )

@@ -11,8 +11,8 @@ from softgym_envs.codesign.metrics.sources import Source, needs_fem
 from softgym_envs.extensions.sensing.information import sensor_information, touch_slopes
 from softgym_envs.extensions.sensing.posterior import Gaussian
 from softgym_envs.extensions.sensing.sensorized_finger import SensorizedFinger, SensorReadings
+from softgym_envs.extensions.sensing.walls import check_cavities
 from softgym_envs.mechanics.constraints.cavity import Cavity
-from softgym_envs.mechanics.surfaces import check_cavities
 from softgym_envs.units import Display
 
 if TYPE_CHECKING:

@@ -17,10 +17,10 @@ import numpy as np
 
 from softgym_envs.designs import DesignSpace, DesignVariable
 from softgym_envs.errors import InfeasibleDesign
+from softgym_envs.extensions.sensing.walls import check_cavities
 from softgym_envs.mechanics.constraints.cavity import Cavity, SealedAir
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.mechanics.solvers.statics import Statics
-from softgym_envs.mechanics.surfaces import check_cavities
 from softgym_envs.robots.base import TOUCH_RADIUS, Actuator
 from softgym_envs.robots.capabilities import LearnedTouch, Learning, Sensing
 from softgym_envs.robots.geometry.finger_shape import (

@@ -16,6 +16,7 @@ from softgym_envs.designs import DesignSpace, DesignVariable
 from softgym_envs.errors import unknown_name
 from softgym_envs.extensions.beams.beam import Beam, Section
 from softgym_envs.extensions.beams.servo import Servo
+from softgym_envs.extensions.beams.slide import Slide
 from softgym_envs.extensions.grasping.grasps import KINDS, GraspObject
 from softgym_envs.extensions.grasping.robots.carried_objects import CARRIED, ROUNDING, Shape
 from softgym_envs.extensions.grasping.robots.contact_aided_finger import ContactAidedFinger
@@ -23,7 +24,6 @@ from softgym_envs.extensions.grasping.robots.lifting import Lifting
 from softgym_envs.mechanics.builder import ModelBuilder
 from softgym_envs.mechanics.constraints.embedding import EmbeddedPoints
 from softgym_envs.mechanics.constraints.point import Point
-from softgym_envs.mechanics.constraints.slide import Slide
 from softgym_envs.mechanics.contact.obstacles import Obstacle, Plane
 from softgym_envs.mechanics.model import MechanicalModel
 from softgym_envs.robots.base import Actuator, Robot
