@@ -183,7 +183,7 @@ def test_a_record_needs_only_what_has_no_default():
     [
         (
             {"radius": 1},
-            r"needs a record with a kind \(plane, sphere, cylinder, rounded_prism, mesh\), got",
+            r"needs a record with a kind \(plane, sphere, cylinder, mesh, rounded_prism\), got",
         ),
         ("plane", "an obstacle needs a record with a kind"),
         ({"kind": "spere"}, "unknown kind of obstacle 'spere'; did you mean 'sphere'"),
