@@ -363,7 +363,7 @@ def test_an_attack_finds_what_random_states_do_not(trunk, monkeypatch):
         rows, found = len(design), np.ones(len(design), bool)
         return StratifiedStates(
             np.repeat(commands.stratum, states), np.repeat(np.arange(count), states), design, command, displacement,
-            command, effector, ~found, ~found, np.ones(rows), np.zeros(rows), found,
+            command, effector, np.zeros((rows, n), bool), ~found, np.ones(rows), np.zeros(rows), found,
         )  # fmt: skip
 
     monkeypatch.setattr(module, "solve_commands", solve)
