@@ -105,11 +105,16 @@ def figure(record: str, name: str, form: str = "") -> str:
 
 
 def drives(study: str) -> str:
-    """Return how far the drives of a study's robot go, and whether it has weight."""
-    robot = load_config(ROOT / "configs" / "codesign" / f"{study}.yaml", StudyConfig).robot
+    """Return how far the drives of a study's robot go, the limits of the study, and whether the robot has weight."""
+    config = load_config(ROOT / "configs" / "codesign" / f"{study}.yaml", StudyConfig)
+    robot, words = config.robot, {"largest_effort": "", "largest_strain": " strain", "self_force": " self-contact"}
     shown = [(actuator, display(actuator.unit)) for actuator in robot.actuators]
     ends = dict.fromkeys(f"{actuator.high * factor:g} {name}" for actuator, (name, factor, _) in shown)
-    return f"drives to {' and '.join(ends)}{'' if any(robot.gravity) else ', no weight'}".replace(" ", "\u00a0")
+    limits = ""
+    for name in filter(config.constraints.get, words):
+        factor, unit = config.objectives[name].scale, config.objectives[name].display.unit
+        limits += f", {config.constraints[name] * factor:g} {unit}{words[name]}"
+    return f"drives to {' and '.join(ends)}{limits}{'' if any(robot.gravity) else ', no weight'}".replace(" ", "\u00a0")
 
 
 def efforts(study: str, row: dict[str, Any]) -> str:

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from softgym_envs.backends import make_backend
 from softgym_envs.mechanics import Statics
 from softgym_envs.viewer.surface import cable_radius
 
 FOLDER = Path(__file__).parents[1] / "examples" / "robots"
-ROBOTS = {"pneunet": "PneuNet", "finray": "FinRay", "tendon_arm": "TendonArm"}
+ROBOTS = {"pneunet": "PneuNet", "valve_bender": "ValveBender", "finray": "FinRay", "tendon_arm": "TendonArm"}
 
 
 @pytest.fixture
@@ -36,6 +37,19 @@ def test_chambers_of_the_bender_mirror_each_other(made):
     assert abs(both.condensed.delta.e[0]) < 1e-4 and both.condensed.delta.e[1] < -5e-4
     left = statics.solve([2e-6, 0.0, 0.0])
     assert left.condensed.delta.e[0] > 5e-4
+
+
+def test_valves_fill_the_chambers_as_syringes_do(made):
+    """The bender on valves is at the equilibrium of the volumes that its pressures pump."""
+    valves, syringes = (make_backend("fem", made(name)) for name in ("valve_bender", "pneunet"))
+    found = valves.step(np.array([4e3, 2e3, 0.002]))
+    np.testing.assert_allclose(found.effort[:2], [4e3, 2e3])
+    assert found.displacement[2] == pytest.approx(0.002) and (found.displacement[:2] > 1e-8).all()
+    twin = syringes.step(found.displacement)
+    np.testing.assert_allclose(twin.effector, found.effector, atol=1e-7)
+    np.testing.assert_allclose(twin.effort, found.effort, rtol=1e-4)
+    with pytest.raises(ValueError, match="all commanded in effort or all in displacement"):
+        make_backend("surrogate", made("valve_bender"))
 
 
 def test_the_rod_holds_the_finger_back(made):

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import itertools
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
-from softgym_envs.errors import ConvergenceError, InfeasibleDesign
+from softgym_envs.errors import ConvergenceError, InfeasibleDesign, MissingLibrary
+from softgym_envs.extras import require
 from softgym_envs.mechanics.condensation import effort_unit
 from softgym_envs.mechanics.elements.tetrahedra import SolidBlock, boundary_triangles
 from softgym_envs.mechanics.model import MechanicalModel
@@ -71,7 +72,8 @@ def check_robot(
 
     Args:
         robot: the robot.
-        bodies: corners of the design box to build, besides the baseline and the bounds of each variable.
+        bodies: corners of the design box to build, and bodies inside it, besides the baseline and the bounds of each
+            variable.
         commands: random commands of the baseline body to solve for.
         seed: of corners and commands.
         progress: called with the name of each examination before it begins.
@@ -109,15 +111,17 @@ def check_robot(
     yield from _commands(robot, statics, rest, rng, commands)
     progress("design box")
     rests: dict[tuple[str, float], Equilibrium] = {}
-    yield _box(robot, rng, bodies, rests)
+    yield from _box(robot, rng, bodies, rests)
     for variable in robot.design_space:
         progress(f"variable {variable.name}")
         yield from _variable(robot, variable.name, rest, rests)
     yield _learning(robot, model)
+    progress("files")
+    yield from _files(robot)
 
 
 def _rest(robot: Robot, statics: Statics) -> Equilibrium:
-    return statics.solve(np.zeros(len(robot.actuators)))
+    return statics.solve(np.zeros(len(robot.actuators)), robot.command_modes)
 
 
 def _effector(robot: Robot, rest: Equilibrium) -> Finding:
@@ -306,14 +310,26 @@ def _commands(
 # -- designs ------------------------------------------------------------------------------------------------------
 
 
-def _box(robot: Robot, rng: np.random.Generator, bodies: int, rests: dict[tuple[str, float], Equilibrium]) -> Finding:
-    """Build the bounds of each variable and random corners; keep the states at rest of the bounds."""
+def _box(
+    robot: Robot, rng: np.random.Generator, bodies: int, rests: dict[tuple[str, float], Equilibrium]
+) -> Iterator[Finding]:
+    """Build the bounds of each variable, random corners and bodies inside; keep the states at rest of the bounds."""
     space = robot.design_space
     names = [variable.name for variable in space]
     tried: list[dict[str, float]] = [{v.name: bound} for v in space for bound in (v.low, v.high)]
     corners = rng.integers(0, 2, (bodies, len(names)))
     for corner in np.unique(corners, axis=0):
         tried.append({v.name: (v.low, v.high)[side] for v, side in zip(space, corner, strict=True)})
+    yield _built(robot, "bodies at the bounds and corners", tried, rests)
+    inside = rng.uniform(-1.0, 1.0, (bodies, len(names)))
+    drawn = [{v.name: float(v.from_unit(unit)) for v, unit in zip(space, row, strict=True)} for row in inside]
+    yield _built(robot, "bodies drawn inside the box", drawn, {})
+
+
+def _built(
+    robot: Robot, which: str, tried: Sequence[dict[str, float]], rests: dict[tuple[str, float], Equilibrium]
+) -> Finding:
+    """Build bodies, and keep the states at rest of those of one variable."""
     failed: list[tuple[dict[str, float], str]] = []
     for design in tried:
         try:
@@ -325,7 +341,7 @@ def _box(robot: Robot, rng: np.random.Generator, bodies: int, rests: dict[tuple[
             continue
         if len(design) == 1:
             rests[next(iter(design.items()))] = rest
-    text = f"{len(tried) - len(failed)} of {len(tried)} bodies at the bounds and corners can be built and held"
+    text = f"{len(tried) - len(failed)} of {len(tried)} {which} can be built and held"
     if not failed:
         return Finding("design box", "good", text)
     design, reason = min(failed, key=lambda pair: len(pair[0]))
@@ -375,6 +391,31 @@ def _variable(
 def _distance(one: np.ndarray, other: np.ndarray) -> float:
     """Return the distance of two matrices relative to the second."""
     return float(np.linalg.norm(one - other) / np.linalg.norm(other))
+
+
+def _files(robot: Robot) -> Iterator[Finding]:
+    """Say which files of a body can be written, and whether it can be filmed."""
+    from softgym_envs.extensions.deployment.moulds import mould_parts
+
+    try:
+        robot.printable().drawing(robot.design_space.complete(None))
+    except ValueError as error:
+        yield Finding("STEP", "note", str(error), "`softgym export` writes STL")
+    else:
+        yield Finding("STEP", "good", "`softgym export` writes it")
+    try:
+        parts = mould_parts(robot)
+    except ValueError as error:
+        yield Finding("moulds", "note", str(error), "only what is cast in one piece needs them")
+    else:
+        yield Finding("moulds", "good", f"`softgym export --moulds` writes {', '.join(parts)}")
+    try:
+        for extra in ("viewer", "video"):
+            require(extra)
+    except MissingLibrary as error:
+        yield Finding("film", "note", str(error), "install it")
+    else:
+        yield Finding("film", "good", "`softgym rollout --video` draws it")
 
 
 def _learning(robot: Robot, model: MechanicalModel) -> Finding:

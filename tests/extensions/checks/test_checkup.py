@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from softgym_envs import DesignSpace, DesignVariable
+from softgym_envs.errors import InfeasibleDesign
 from softgym_envs.extensions.checks.checkup import check_robot, wall_layers
 from softgym_envs.mechanics import MechanicalModel, Plane
 from softgym_envs.robots import Actuator, Robot
@@ -69,13 +70,24 @@ class Limited(Beam):
     actuators = tuple(Actuator(name, low=0.0, high=0.003, rate=0.0005, max_effort=1e-3) for name in ("upper", "lower"))
 
 
+class Narrow(Beam):
+    def modulus(self, design):
+        if 2e5 < design["young_modulus"] < 9.9e5 and design["young_modulus"] != 5e5:
+            raise InfeasibleDesign("only the ends can be made")
+        return design["young_modulus"]
+
+
 def examine(cls):
     return list(check_robot(cls(), bodies=2, commands=4))
 
 
 def test_a_sound_robot_has_no_fault():
     findings = examine(Beam)
-    assert {finding.verdict for finding in findings} == {"good"}, findings
+    notes = {finding.subject: finding.text for finding in findings if finding.verdict != "good"}
+    assert set(notes) - {"film"} == {"STEP", "moulds"}, findings  # it is no drawing
+    assert "no exact shape for STEP" in notes["STEP"] and "allowed: robots that draw their body" in notes["moulds"]
+    inside = [finding.text for finding in findings if "inside the box" in finding.text]
+    assert inside == ["2 of 2 bodies drawn inside the box can be built and held"]
     subjects = {finding.subject for finding in findings}
     assert {"baseline", "effector", "walls", "actuators", "commands", "efforts", "design box", "surrogate"} <= subjects
 
@@ -89,6 +101,7 @@ def test_a_sound_robot_has_no_fault():
         (Slack, "actuators", "fault", "nothing holds it"),
         (Touching, "contact", "note", "up to 1 mm outside of the body, 10% of its thinnest wall"),
         (Limited, "surrogate", "note", "beyond max_effort"),
+        (Narrow, "design box", "fault", "of 2 bodies drawn inside the box can be built and held; young_modulus ="),
         (Limited, "efforts", "note", "beyond max_effort = 0.001 N"),
     ],
 )
