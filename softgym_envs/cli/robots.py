@@ -56,10 +56,11 @@ def show(robot: str, options_: tuple[str, ...], design: tuple[str, ...], picture
             click.echo(f"  {variable.name:16s} {values[variable.name]:<10g} {bounds:24s} {variable.description}")
         click.echo("\nactuators:")
         for actuator in body.actuators:
-            click.echo(
-                f"  {actuator.name:16s} {actuator.low:g} to {actuator.high:g} {actuator.unit}, "
-                f"at most {actuator.rate:g} {actuator.unit} per step"
-            )
+            (low, high), rate, unit = actuator.command_range, actuator.command_rate, actuator.command_unit
+            text = f"  {actuator.name:16s} {low:g} to {high:g} {unit}, at most {rate:g} {unit} per step"
+            if actuator.by_effort:
+                text += f"; displacements {actuator.low:g} to {actuator.high:g} {actuator.unit}"
+            click.echo(text)
         if mesh is not None:
             text = f"mesh: {len(mesh.nodes)} nodes, {len(mesh.tetrahedra)} tetrahedra ({mesh.origin})"
         else:

@@ -150,8 +150,8 @@ def check_compiled(config: TrainConfig, backend: object) -> None:
     """Check that a learner can follow derivatives through the motions of an environment.
 
     Raises:
-        ValueError: for an environment with drawn bodies, other actions than changes of commands, or without motion on
-            finite elements in compiled code.
+        ValueError: for an environment with drawn bodies, other actions than changes of commands, commanded efforts, or
+            without motion on finite elements in compiled code.
     """
     learner, environment = config.learner, config.environment
     if environment.sample_design or environment.action_mode != "increment" or environment.residual_scale:
@@ -159,6 +159,7 @@ def check_compiled(config: TrainConfig, backend: object) -> None:
             f"learner '{learner}' needs one body, action_mode = increment and no residual_scale, got sample_design = "
             f"{environment.sample_design}, {environment.action_mode} and {environment.residual_scale:g}"
         )
+    backend.robot.needs_displacements(f"learner '{learner}'")
     if not isinstance(backend, FEMBackend) or not backend.moving or backend.not_compiled is not None:
         why = (backend.not_compiled if isinstance(backend, FEMBackend) else None) or "no motion"
         raise ValueError(f"learner '{learner}' needs a motion on finite elements in compiled code: {why}")
