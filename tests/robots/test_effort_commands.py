@@ -16,7 +16,7 @@ from softgym_envs.extensions.beams.robots.stiff_flop import StiffFlop
 from softgym_envs.extensions.fitting.training import FitConfig, check_learnable
 from softgym_envs.robots import Actuator
 
-PRESSED = {"robot_options": {"largest_pressure": 1e5}}
+PRESSED: dict[str, Any] = {"robot_options": {"largest_pressure": 1e5}}
 
 
 class Mixed(StiffFlop):
@@ -102,11 +102,10 @@ def test_the_inverse_qp_reaches_goals_by_pressures(backend):
 def test_rewards_have_the_slopes_of_their_differences(robot, backend):
     if robot is Mixed and backend == "surrogate":
         pytest.skip("a surrogate takes one kind of commands")
-    options = PRESSED["robot_options"] if robot == "trunk" else {}
-    made: Any = gym.make_vec(
-        "SoftGym/Reach-v0", num_envs=3, robot=robot, backend=backend, robot_options=options,
-        **({"backend_options": {"members": 1}} if backend == "surrogate" else {}),
-    )  # fmt: skip
+    options: dict[str, Any] = {"robot_options": PRESSED["robot_options"] if robot == "trunk" else {}}
+    if backend == "surrogate":
+        options["backend_options"] = {"members": 1}
+    made: Any = gym.make_vec("SoftGym/Reach-v0", num_envs=3, robot=robot, backend=backend, **options)
 
     def after(last):
         made.reset(seed=1)
@@ -151,7 +150,7 @@ def test_batches_of_beams_follow_pressures_as_single_bodies_do(twins):
 def test_a_model_is_learned_over_displacements(twins):
     # The largest effort of a commanded displacement is beyond a model; that of a commanded effort is a command.
     data = dict.fromkeys(("train", "validation", "test"), {"groups": 2, "states": 2})
-    check_learnable(twins[0], FitConfig(robot="trunk", data=data))
+    check_learnable(twins[0], FitConfig.model_validate({"robot": "trunk", "data": data}))
     assert twins[0].effort_limited == [] and twins[0].mechanics_key == twins[1].mechanics_key
 
 
