@@ -36,7 +36,7 @@ LAYERS = [
     {"softgym_envs.cli"},
     # Extensions: no core package imports one. Those of one layer do not know each other.
     {"softgym_envs.extensions.paths"},
-    {"softgym_envs.extensions", "softgym_envs.extensions.beams", "softgym_envs.extensions.checks"}
+    {"softgym_envs.extensions", "softgym_envs.extensions.beams"}
     | {"softgym_envs.extensions.learners", "softgym_envs.extensions.motion"}
     | {"softgym_envs.extensions.postgres", "softgym_envs.extensions.recordings"}
     | {"softgym_envs.extensions.sweeps"},
@@ -53,7 +53,7 @@ LAYERS = [
         "softgym_envs.extensions.walkers",
     },
     {"softgym_envs.extensions.deployment", "softgym_envs.extensions.leaderboard"},
-    {"softgym_envs.extensions.modules"},
+    {"softgym_envs.extensions.checks", "softgym_envs.extensions.modules"},
 ]
 LEVEL = {package: level for level, layer in enumerate(LAYERS) for package in layer}
 # The viewer is imported only inside the functions that draw.
