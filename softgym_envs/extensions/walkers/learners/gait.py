@@ -159,10 +159,10 @@ def check_compiled(config: TrainConfig, backend: object) -> None:
             f"learner '{learner}' needs one body, action_mode = increment and no residual_scale, got sample_design = "
             f"{environment.sample_design}, {environment.action_mode} and {environment.residual_scale:g}"
         )
-    backend.robot.needs_displacements(f"learner '{learner}'")
     if not isinstance(backend, FEMBackend) or not backend.moving or backend.not_compiled is not None:
         why = (backend.not_compiled if isinstance(backend, FEMBackend) else None) or "no motion"
         raise ValueError(f"learner '{learner}' needs a motion on finite elements in compiled code: {why}")
+    backend.robot.needs_displacements(f"learner '{learner}'")
 
 
 def resampled_gait(robot: RhythmicRobot, period: int) -> np.ndarray:
