@@ -26,7 +26,7 @@ HOLES = {
     ("SoftGym/SwimmerSwim-v0", "surrogate"): "no weights ship for 'swimmer'",
     ("SoftGym/SwimmerSwim-v0", "hybrid"): "no weights ship for 'swimmer'",
     # Statics say nothing of a swing.
-    ("SoftGym/WhipThrow-v0", "surrogate"): "no weights ship for 'whip'",
+    ("SoftGym/WhipThrow-v0", "surrogate"): "robot 'whip': a surrogate drives actuators beyond their max_effort",
     ("SoftGym/WhipThrow-v0", "hybrid"): "no weights ship for 'whip'",
 }
 """What a user is told who asks for what there is not, by ID and backend."""

@@ -15,6 +15,7 @@ from softgym_envs.backends.registry import BACKENDS as ALL_BACKENDS
 from softgym_envs.envs.tasks.registry import make_task
 from softgym_envs.errors import ConvergenceError, DesignError
 from softgym_envs.extensions.walkers.tasks.locomotion import Locomotion
+from softgym_envs.extensions.walkers.tasks.throw import Throw
 from softgym_envs.robots.base import Robot
 
 BACKENDS = [name for name in ALL_BACKENDS if name != "hardware"]  # which needs a bench
@@ -144,21 +145,21 @@ def test_bounds_time_limit_and_info(identifier, options, episodes, action_mode):
             steps += 1
             assert env.observation_space.contains(observation)
             assert terminated == info["is_failed"]
-            assert 0.0 <= reward <= 1.0 or isinstance(env.unwrapped.task, Locomotion)  # a speed
+            assert 0.0 <= reward <= 1.0 or isinstance(env.unwrapped.task, Locomotion | Throw)  # a speed, a gain
             assert (np.abs(env.unwrapped.state.command - before) <= env.unwrapped.robot.rates + 1e-15).all()
         assert steps == limit or terminated
     assert set(info) >= {"effector", "goal", "distance", "is_success", "displacement", "effort"}
     task = env.unwrapped.task
     # Their distances count one side only, are relative, or velocities.
-    if task.name not in ("carry", "grasp") and not isinstance(task, Locomotion):
+    if task.name not in ("carry", "grasp") and not isinstance(task, Locomotion | Throw):
         error = task.axes * (info["effector"] - info["goal"])
         assert info["distance"] == pytest.approx(np.linalg.norm(error), abs=1e-12)
     assert info["is_success"] == (info["distance"] < env.unwrapped.task.success_distance)
     assert info["converged"]
     check_info(info)
     terms = [value for name, value in info.items() if name.startswith("reward_")]
-    combined = np.sum(terms) if isinstance(task, Locomotion) else np.prod(terms)
-    assert len(terms) >= 2 and reward == pytest.approx(combined)
+    combined = np.sum(terms) if isinstance(task, Locomotion | Throw) else np.prod(terms)
+    assert len(terms) >= (1 if isinstance(task, Throw) else 2) and reward == pytest.approx(combined)
     unilateral = env.unwrapped.robot.unilateral
     assert (info["effort"][unilateral] >= 0.0).all()
 
