@@ -208,19 +208,8 @@ class EnvironmentConfig(Config):
             from softgym_envs.agents.residual import VectorResidualQP
 
             return VectorResidualQP(envs, self.residual_scale)
-        return gymnasium.make_vec(
-            self._spec(),
-            num_envs=num_envs,
-            vectorization_mode="async" if num_envs > 1 else "sync",
-            # The QP of each environment runs in its process too.
-            vector_kwargs={
-                "autoreset_mode": gymnasium.vector.AutoresetMode.SAME_STEP,
-                # Set explicitly: the start method of joblib's workers cannot pickle these environments.
-                **({"context": "fork"} if num_envs > 1 else {}),
-            },
-            wrappers=[self._wrapped],
-            **self._options(overrides),
-        )
+        # The QP of each environment runs in its process too.
+        return gymnasium.make_vec(self._spec(), num_envs=num_envs, wrap=self._wrapped, **self._options(overrides))
 
 
 class LearnerConfig(Config):

@@ -6,7 +6,7 @@ import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 from weakref import WeakSet
 
@@ -70,6 +70,7 @@ class ParallelVectorEnv(AsyncVectorEnv):
         num_envs: number of sub-environments.
         max_episode_steps: time limit; default none.
         autoreset_mode: as for `SoftRobotVectorEnv`.
+        wrap: returns an environment with wrappers, which each process then steps; default none.
         **options: those of `SoftRobotEnv`.
 
     Raises:
@@ -88,13 +89,15 @@ class ParallelVectorEnv(AsyncVectorEnv):
         *,
         max_episode_steps: int | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        wrap: Callable[[gymnasium.Env], gymnasium.Env] | None = None,
         **options: Any,
     ) -> None:
         check_counts(num_envs, max_episode_steps)
         mode = check_autoreset(autoreset_mode)
         env = SoftRobotEnv(robot, task, **options)
         self.robot, self.task, self.spaces, self.design_space = env.robot, env.task, env.spaces, env.design_space
-        limited = env if max_episode_steps is None else TimeLimit(env, max_episode_steps)
+        limited: gymnasium.Env = env if max_episode_steps is None else TimeLimit(env, max_episode_steps)
+        limited = limited if wrap is None else wrap(limited)
         super().__init__(
             [_Worker(limited, index) for index in range(num_envs)],
             context="fork" if "fork" in multiprocessing.get_all_start_methods() else None,

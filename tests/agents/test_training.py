@@ -485,13 +485,19 @@ def test_the_best_policy_survives_an_interruption(tmp_path, monkeypatch):
     assert any((kept[name] != value).any() for name, value in seen[2].items())
 
 
-def test_a_card_counts_the_time_of_the_processes_of_its_environments(tmp_path):
+@pytest.mark.parametrize("correction", [{}, {"residual_scale": 0.5}], ids=["plain", "residual"])
+def test_a_card_counts_the_time_of_the_processes_of_its_environments(correction, tmp_path):
     def of_children():
         spent = resource.getrusage(resource.RUSAGE_CHILDREN)  # processes that have ended, as those of a training have
         return spent.ru_utime + spent.ru_stime
 
     environment = {"id": "SoftGym/TetrapodCarry-v0", "task_options": {"push": 1.0}, "robot_options": {"elements": 2}}
-    data = {"environment": environment, "learner": "ppo", "ppo": {"n_steps": 2, "batch_size": 2}, "num_envs": 2}
+    data = {
+        "environment": environment | correction,
+        "learner": "ppo",
+        "ppo": {"n_steps": 2, "batch_size": 2},
+        "num_envs": 2,
+    }
     config = TrainConfig.model_validate({**data, "steps": 16, "evaluation_episodes": 1, "report_every": 16})
     own, children, all_ = time.process_time(), of_children(), cpu_seconds()
     card = read_json(train(config, tmp_path / "run", progress=False).with_suffix(".json"))
