@@ -1,4 +1,4 @@
-"""Compiled solvers of bodies of beams against the general ones: speed in CPU time, and equality of the results."""
+"""Compiled solvers of bodies of beams: speed in CPU time, and the same results as those of the general ones."""
 
 from __future__ import annotations
 
@@ -9,11 +9,15 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-import softgym_envs  # noqa: F401 - registers the IDs
+from softgym_envs import make_robot
+from softgym_envs.backends.fem import FEMBackend
+from softgym_envs.extensions.beams.fem_batch import FEMBatch
 
 CASES = {"Tetrapod": "SoftGym/TetrapodReach-v0", "Stiff-Flop": "SoftGym/TrunkReach-v0"}
 STEPS, BLOCKS = 20, 6
 """Environment steps of a timed block, and how many blocks each solver has; blocks of both take turns."""
+PERIOD, ROWS = 10, 16
+"""Control steps of a period of a gait, and bodies of a batch that walks."""
 
 
 def environment(identifier: str, *, compiled: bool, design: dict[str, float] | None = None) -> Any:
@@ -101,3 +105,37 @@ def compiled_share(identifier: str, bodies: int = 10, steps: int = 20) -> float:
             env.step(rng.uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32))
             calls += needed
     return 1.0 - calls / (bodies * steps)
+
+
+def walking() -> dict[str, object]:
+    """Control steps per second of a quadruped that walks, W and contact included: one body, and many in two threads.
+
+    They are five time steps each, of the reference gait from its second period on. Threads are told by pairs of blocks,
+    with one thread and with two, which share what else the machine does.
+    """
+    robot = make_robot("quadruped")
+    gait, body = robot.reference_gait(), robot.design_space.baseline.array
+    single = FEMBackend(robot, dynamics=True)
+    speeds: list[float] = []
+    for block in range(BLOCKS + 1):
+        start = time.process_time()
+        for k in range(2 * PERIOD):
+            single.step(gait[k % PERIOD])
+        if block:  # the first one compiles
+            speeds.append(2 * PERIOD / (time.process_time() - start))
+    batches = {threads: FEMBatch(robot, np.tile(body, (ROWS, 1)), threads=threads, dynamics=True) for threads in (1, 2)}
+    seconds: dict[int, list[tuple[float, float]]] = {1: [], 2: []}
+    for block in range(BLOCKS + 1):
+        for threads, batch in batches.items():
+            started = time.process_time(), time.perf_counter()
+            for k in range(PERIOD):
+                batch.step(gait[(k + np.arange(ROWS)) % PERIOD])
+            if block:
+                seconds[threads].append((time.process_time() - started[0], time.perf_counter() - started[1]))
+    one, two = np.array(seconds[1]), np.array(seconds[2])
+    return {
+        "one body: steps per CPU second": statistics.median(speeds),
+        f"{ROWS} bodies: steps per CPU second": ROWS * PERIOD / float(np.median(one[:, 0])),
+        "two threads: CPU seconds, times those of one": float(np.median(two[:, 0] / one[:, 0])),
+        "two threads: times as fast as one by the clock": float(np.median(one[:, 1] / two[:, 1])),
+    }

@@ -27,6 +27,7 @@ BENCHMARKS: dict[str, Callable[[], dict[str, object]]] = {
     "fem_profile": speed.fem_profile,
     "fem_speed": speed.fem_speed,
     "beams": beams.beams,
+    "walking": beams.walking,
     "learned_tetrapod": parts.learned_tetrapod,
     "notched_beam": speed.notched_beam,
     "surrogate_step": speed.surrogate_step,

@@ -32,7 +32,8 @@ class Work(NamedTuple):
         block: of the tangent, shape (6, 6).
         way: shape (3,).
         slope: shape (3,).
-        motion: of the tangent of a chamber by three frames, shape (3, 18).
+        pulled: length of a line of a chamber by the motions of three frames, shape (3, 6).
+        arms: of a line of a chamber, from three frames, shape (3, 3).
     """
 
     z: np.ndarray
@@ -47,7 +48,8 @@ class Work(NamedTuple):
     block: np.ndarray
     way: np.ndarray
     slope: np.ndarray
-    motion: np.ndarray
+    pulled: np.ndarray
+    arms: np.ndarray
 
 
 def make_work() -> Work:
@@ -65,7 +67,8 @@ def make_work() -> Work:
         block=np.zeros((6, 6)),
         way=np.zeros(3),
         slope=np.zeros(3),
-        motion=np.zeros((3, 3 * 6)),
+        pulled=np.zeros((3, 6)),
+        arms=np.zeros((3, 3)),
     )
 
 

@@ -90,7 +90,7 @@ def _prism(p, parameters, edges, normal, curvature):
     return found[0]
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@njit(cache=True, error_model="numpy", _nrt=False, forceinline=False)
 def gap_of(p, parameters, edges, normal, curvature):
     """Return the gap [m] of a point (3,) to an obstacle; fill its normal (3,) and curvature (3, 3)."""
     kind = int(parameters[0])
@@ -175,7 +175,7 @@ def barrier_curvature(gap, distance):
     return -(4.0 * s * (2.0 * log + 4.0 * rest / s - rest * rest / (s * s)) + 2.0 * by_s) / distance
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)
 def stretch_of(p, obstacle, edges, anchor, out):
     """Fill ``out.direction`` with the stretch of a friction spring along the surface [m]; return its length [m]."""
     along, place = out.direction, out.place
@@ -189,7 +189,7 @@ def stretch_of(p, obstacle, edges, anchor, out):
     return math.sqrt(square)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)
 def add_friction(p, obstacle, edges, anchor, spring, limit, out):
     """Add the friction of a spring [N/m] whose limit [N] is held to pull and tangent; its energy [J] and if it slides.
 

@@ -31,6 +31,7 @@ class FEMBatch(BatchBackend):
     Args:
         robot: a robot with ``made_of_beams``; one that touches something can only move in time.
         designs: bodies, shape (B, number of design variables).
+        threads: how many share the rows of a step, see `BeamBatch`.
         **options: those of `FEMBackend`.
 
     Raises:
@@ -38,9 +39,9 @@ class FEMBatch(BatchBackend):
         ValueError: for an option of another kind.
     """
 
-    def __init__(self, robot: Robot, designs: np.ndarray, **options: Any) -> None:
+    def __init__(self, robot: Robot, designs: np.ndarray, *, threads: int | None = None, **options: Any) -> None:
         self.robot = robot
-        self._options = options
+        self._options, self._threads = options, threads
         self._designs = [self._design(values) for values in designs]
         self._build()
         first = self._first
@@ -87,7 +88,8 @@ class FEMBatch(BatchBackend):
         self._numbers = np.array([numbers[design] for design in self._designs])
         solvers = [_beams(owner) for owner in self._owners.values()]
         self._frames = solvers[0].body.elements.frames
-        self._beams = BeamBatch([s.body for s in solvers], [owner.model.loads for owner in self._owners.values()])
+        loads = [owner.model.loads for owner in self._owners.values()]
+        self._beams = BeamBatch([s.body for s in solvers], loads, threads=self._threads)
 
     @property
     def rest_sizes(self) -> np.ndarray:

@@ -4,6 +4,7 @@ import pickle
 from dataclasses import replace
 
 import gymnasium
+import numba
 import numpy as np
 import pytest
 
@@ -15,7 +16,7 @@ from softgym_envs.errors import InfeasibleDesign
 from softgym_envs.extensions.beams import fem_batch
 from softgym_envs.extensions.beams.fem_batch import FEMBatch
 from softgym_envs.extensions.beams.robots.tetrapod import Tetrapod
-from softgym_envs.extensions.beams.solver.batch import BeamBatch
+from softgym_envs.extensions.beams.solver.batch import BeamBatch, thread_count
 from softgym_envs.surrogate.domain import FOLDED
 
 TETRAPOD, TRUNK = "SoftGym/TetrapodReach-v0", "SoftGym/TrunkReach-v0"
@@ -171,6 +172,23 @@ def test_rows_in_contact_are_single_bodies():
         np.testing.assert_array_equal(copied.state.effector, batch.state.effector)
     with pytest.raises(ValueError, match="robot 'tetrapod' touches obstacles: its equilibria have no gradient"):
         batch.gradient(np.zeros((2, 3)), np.zeros((2, 4)))
+
+
+def test_threads_share_the_rows_and_change_nothing(monkeypatch):
+    robot = Tetrapod(elements=2, **TABLE)
+    bodies = np.tile(robot.design_space.baseline.array, (3, 1))
+    batches = [FEMBatch(robot, bodies, threads=count, dynamics=True) for count in (1, 2, 4)]
+    for command in np.random.default_rng(0).uniform(-0.6, -0.2, (3, 3, 4)):
+        for batch in batches:
+            batch.step(command)
+        one, *others = [(b.state.effector, b.state.effort, b.condensed.compliance, b._present.anchors) for b in batches]
+        for found in others:
+            assert all((a == b).all() for a, b in zip(one, found, strict=True))
+    monkeypatch.delenv("NUMBA_NUM_THREADS", raising=False)
+    assert thread_count() == 1
+    monkeypatch.setenv("NUMBA_NUM_THREADS", "2")
+    monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", 2)
+    assert thread_count() == 2
 
 
 def test_tasks_that_push_step_in_processes():

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
+import numba
 import numpy as np
 from numba import types
 from numba.extending import overload
@@ -84,24 +87,32 @@ class BeamStates(NamedTuple):
         return self._replace(**{name: array.copy() for name, array in self._asdict().items() if array is not None})
 
 
+def thread_count() -> int:
+    """Return ``NUMBA_NUM_THREADS`` where that is set, otherwise 1: cores belong to processes unless a user says so."""
+    return int(numba.config.NUMBA_NUM_THREADS) if "NUMBA_NUM_THREADS" in os.environ else 1
+
+
 class BeamBatch:
     """Bodies of the same layout: the same frames, elements and constraints with other dimensions.
 
     Args:
         bodies: their arrays.
         loads: dead loads of each [N], shape (n, 3).
+        threads: how many threads share the states of a step; default `thread_count`. Results do not depend on it.
 
     Raises:
         ValueError: for bodies of different layouts.
     """
 
-    def __init__(self, bodies: Sequence[BeamBody], loads: Sequence[np.ndarray]) -> None:
+    def __init__(self, bodies: Sequence[BeamBody], loads: Sequence[np.ndarray], *, threads: int | None = None) -> None:
         self._bodies = stacked(bodies)
         self._loads = np.ascontiguousarray(loads)
         body = bodies[0]
         size = len(body.servos.number) + 3 * len(body.points.number) + len(body.chambers.number)
-        self._system = make_system(body, size)
-        self._strains = np.zeros((len(body.elements.frames), 2, 6))
+        self._work = [
+            (make_system(body, size), np.zeros((len(body.elements.frames), 2, 6)))
+            for _ in range(threads or thread_count())
+        ]
 
     def march(
         self,
@@ -137,21 +148,33 @@ class BeamBatch:
             Which states reached their last target, and which of them are stable, shapes (B,).
         """
         solved, stable = np.zeros(len(bodies), dtype=bool), np.zeros(len(bodies), dtype=bool)
-        _march_all(
-            self._bodies,
-            self._loads,
-            bodies,
-            self._system,
-            self._strains,
-            states,
-            targets,
-            is_driven,
-            unilateral,
-            limit,
-            Stepping(self._loads[0], step, mass_damping, stiffness_damping, tolerance, cuts),
-            solved,
-            stable,
-        )
+        stepping = Stepping(self._loads[0], step, mass_damping, stiffness_damping, tolerance, cuts)
+
+        def run(number: int) -> None:
+            """Step the share of the states that belongs to a thread."""
+            system, strains = self._work[number]
+            part = slice(*(len(bodies) * (number + k) // len(self._work) for k in range(2)))
+            _march_all(
+                self._bodies,
+                self._loads,
+                bodies[part],
+                system,
+                strains,
+                BeamStates._make(None if array is None else array[part] for array in states),
+                targets[part],
+                is_driven,
+                unilateral,
+                limit,
+                stepping,
+                solved[part],
+                stable[part],
+            )
+
+        if len(self._work) == 1:
+            run(0)
+        else:
+            with ThreadPoolExecutor(len(self._work)) as pool:
+                list(pool.map(run, range(len(self._work))))
         return solved, stable
 
 
@@ -239,7 +262,7 @@ def _put(array, k, row):
     array[k] = row
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 def _march_all(
     bodies, loads, numbers, system, strains, states, targets, is_driven, unilateral, limit, stepping, solved, stable
 ):

@@ -88,8 +88,8 @@ def analyse(count: int, pairs: Iterable[tuple[int, int]]) -> tuple[np.ndarray, B
 @njit(cache=True, error_model="numpy", _nrt=False)
 def copy_values(source, out):
     """Fill an array with the values of another one of its shape, which kernels without references cannot assign."""
-    flat, given = out.reshape(out.size), source.reshape(source.size)
-    for i in range(flat.shape[0]):
+    flat, given = out.flat, source.flat
+    for i in range(out.size):
         flat[i] = given[i]
 
 

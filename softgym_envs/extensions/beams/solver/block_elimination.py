@@ -34,11 +34,17 @@ def _invert(D):
 def _subtract_product(L, U, target):
     """Subtract the product of two blocks from another one."""
     for i in range(SIZE):
-        for j in range(SIZE):
-            value = target[i, j]
-            for m in range(SIZE):
-                value -= L[i, m] * U[m, j]
-            target[i, j] = value
+        T = target[i]
+        a, b, c, d, e, f = T[0], T[1], T[2], T[3], T[4], T[5]
+        for m in range(SIZE):
+            v, R = L[i, m], U[m]
+            a -= v * R[0]
+            b -= v * R[1]
+            c -= v * R[2]
+            d -= v * R[3]
+            e -= v * R[4]
+            f -= v * R[5]
+        T[0], T[1], T[2], T[3], T[4], T[5] = a, b, c, d, e, f
 
 
 @njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
@@ -57,11 +63,16 @@ def eliminate_blocks(upper, lower, pointers, targets, row):
             for i in range(SIZE):
                 for j in range(SIZE):
                     row[j] = B[i, j]
-                for j in range(SIZE):
-                    value = 0.0
-                    for m in range(SIZE):
-                        value += row[m] * D[m, j]
-                    B[i, j] = value
+                a, b, c, d, e, f = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+                for m in range(SIZE):
+                    v, R = row[m], D[m]
+                    a += v * R[0]
+                    b += v * R[1]
+                    c += v * R[2]
+                    d += v * R[3]
+                    e += v * R[4]
+                    f += v * R[5]
+                B[i, 0], B[i, 1], B[i, 2], B[i, 3], B[i, 4], B[i, 5] = a, b, c, d, e, f
             for q in range(pointers[k], p + 1):
                 _subtract_product(lower[q], upper[count + p], upper[targets[t]])
                 if q < p:

@@ -71,6 +71,9 @@ class LocalForces(NamedTuple):
         tangent: its derivative, shape (k, 3, 3).
         residual: by how much forces and contact differ [N], shape (3 k,).
         motion: what that moves [m], shape (3 k,).
+        moved: what the forces move, less what the present ones do [m], shape (3 k,).
+        before: the same before a step of the forces [m], shape (3 k,).
+        reach: what the whole step moves [m], shape (3 k,).
         step: of the forces [N], shape (3 k,).
         kept: forces before the step [N], shape (3 k,).
         spare: shape (3 k,).
@@ -110,6 +113,9 @@ class LocalForces(NamedTuple):
     tangent: np.ndarray
     residual: np.ndarray
     motion: np.ndarray
+    moved: np.ndarray
+    before: np.ndarray
+    reach: np.ndarray
     step: np.ndarray
     kept: np.ndarray
     spare: np.ndarray
@@ -226,6 +232,9 @@ def _make_local(contact: ContactPoints, blocks: int, size: int, stored: int) -> 
         tangent=np.zeros((k, 3, 3)),
         residual=np.zeros(3 * k),
         motion=np.zeros(3 * k),
+        moved=np.zeros(3 * k),
+        before=np.zeros(3 * k),
+        reach=np.zeros(3 * k),
         step=np.zeros(3 * k),
         kept=np.zeros(3 * k),
         spare=np.zeros(3 * k),
@@ -252,7 +261,7 @@ def _make_local(contact: ContactPoints, blocks: int, size: int, stored: int) -> 
     )
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST, forceinline=True)
 def point_at(contact, g, k, x, out):
     """Fill a point [m] (3,) of group ``g``."""
     p, q, r = 0.0, 0.0, 0.0
@@ -336,7 +345,7 @@ def find_near(contact, slides, x, other):
     The list stays while no point that is not listed can have come so near.
     """
     near, p = slides.near, slides.p
-    if _covers(contact, near, x) and _covers(contact, near, other):
+    if _covers(contact, near, x) and (other is x or _covers(contact, near, other)):
         return
     _fill_moved(contact, near, x, other)
     count, distance = 0, contact.law[0]
@@ -471,17 +480,17 @@ def slide(slides, y, signs):
     count = slides.number[0]
     if count <= 0:
         return
-    flat, sign, slip = y.reshape(y.size), signs.reshape(signs.size), slides.slip
+    flat, sign, slip = y.flat, signs.flat, slides.slip
     for s in range(count):
-        loading, value = slides.loading[s].reshape(y.size), 0.0
-        for i in range(flat.shape[0]):
+        loading, value = slides.loading[s].flat, 0.0
+        for i in range(y.size):
             value += loading[i] * sign[i] * flat[i]
         slip[s] = value
     for s in range(count):
-        value, direction = 0.0, slides.direction[s].reshape(y.size)
+        value, direction = 0.0, slides.direction[s].flat
         for t in range(count):
             value += slides.core[s, t] * slip[t]
-        for i in range(flat.shape[0]):
+        for i in range(y.size):
             flat[i] -= value * direction[i]
 
 

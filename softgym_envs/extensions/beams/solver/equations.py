@@ -438,10 +438,52 @@ def add_constraints(body, x, effort, equations, full):
 
 
 @njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
+def _add_norm(scale, share, arm, pulled, other_share, other_arm, other_pulled, block):
+    """Add ``scale (1 - t t^T)``, on the motion of a vector with direction ``t``, to the block of two frames.
+
+    A frame moves the vector by ``share u + w x arm``, and its length by ``pulled`` (6,).
+    """
+    p, q, r = scale * arm[0], scale * arm[1], scale * arm[2]
+    u, v, w = other_arm[0], other_arm[1], other_arm[2]
+    for i in range(6):
+        value = scale * pulled[i]
+        for j in range(6):
+            block[i, j] -= value * other_pulled[j]
+    both, along = scale * share * other_share, p * u + q * v + r * w
+    for i in range(3):
+        block[i, i] += both
+        block[3 + i, 3 + i] += along
+    # u . (w x other_arm), (w x arm) . u and (w x arm) . (v x other_arm)
+    f, g, h = scale * share * u, scale * share * v, scale * share * w
+    block[0, 4] += h
+    block[0, 5] -= g
+    block[1, 5] += f
+    block[1, 3] -= h
+    block[2, 3] += g
+    block[2, 4] -= f
+    f, g, h = other_share * p, other_share * q, other_share * r
+    block[4, 0] += h
+    block[5, 0] -= g
+    block[5, 1] += f
+    block[3, 1] -= h
+    block[3, 2] += g
+    block[4, 2] -= f
+    block[3, 3] -= u * p
+    block[3, 4] -= u * q
+    block[3, 5] -= u * r
+    block[4, 3] -= v * p
+    block[4, 4] -= v * q
+    block[4, 5] -= v * r
+    block[5, 3] -= w * p
+    block[5, 4] -= w * q
+    block[5, 5] -= w * r
+
+
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
 def _add_chambers(chambers, rows, x, effort, equations, full):
     """Do for chambers what `add_constraints` does for the others."""
     gradient, H, delta, tangent = equations.gradient, equations.H, equations.delta, equations.tangent
-    t, motion = equations.work.way, equations.work.motion
+    t, pulled, arms = equations.work.way, equations.work.pulled, equations.work.arms
     for c in range(chambers.number.shape[0]):
         delta[chambers.number[c]] = -chambers.rest[c]
     for q in range(chambers.chamber.shape[0]):
@@ -466,43 +508,31 @@ def _add_chambers(chambers, rows, x, effort, equations, full):
                 gradient[row, 2] -= share * w
         if not full:
             continue
-        # The motion of the tangent: frame a, or the one on which it is mounted, moves it by weights[a, 0] u + w x p.
+        # Frame a, or the one on which it is mounted, moves the tangent by weights[a, 0] u + w x arm.
         for a in range(3):
             mount = chambers.mount[q, a]
             for d in range(3):
-                e, f = (d + 1) % 3, (d + 2) % 3
                 p = 0.0
                 for k in range(1, 4):
                     p += weights[a, k] * x[frames[a] + k, d]
                 if mount >= 0:
                     p += weights[a, 0] * (x[frames[a], d] - x[mount, d])
-                for g in range(3):
-                    motion[g, 6 * a + d] = weights[a, 0] if g == d else 0.0
-                # w x p has the components w_f p_d along e and -w_e p_d along f.
-                motion[d, 6 * a + 3 + d] = 0.0
-                motion[e, 6 * a + 3 + f] = p
-                motion[f, 6 * a + 3 + e] = -p
-        for a in range(3):
-            block = rows.block[frames[a]]
-            if block >= 0:
+                arms[a, d] = p
+            arm, part = arms[a], pulled[a]
+            part[0], part[1], part[2] = weights[a, 0] * t[0], weights[a, 0] * t[1], weights[a, 0] * t[2]
+            part[3], part[4] = arm[1] * t[2] - arm[2] * t[1], arm[2] * t[0] - arm[0] * t[2]
+            part[5] = arm[0] * t[1] - arm[1] * t[0]
+            b = rows.block[frames[a]]
+            if b >= 0:
                 for i in range(6):
-                    for d in range(3):
-                        H[c, block, i] += area * motion[d, 6 * a + i] * t[d]
+                    H[c, b, i] += area * part[i]
         # Second derivative of the norm: (1 - t t^T) / norm on the motion of the tangent.
-        for i in range(18):
-            along = motion[0, i] * t[0] + motion[1, i] * t[1] + motion[2, i] * t[2]
-            for d in range(3):
-                motion[d, i] -= along * t[d]
+        scale = -pull / norm
         for a in range(3):
             for b in range(3):
-                place = chambers.place[q, a, b]
+                place, share, other = chambers.place[q, a, b], weights[a, 0], weights[b, 0]
                 if place >= 0:
-                    block, scale = tangent[place], -pull / norm
-                    for i in range(6):
-                        for d in range(3):
-                            value = scale * motion[d, 6 * a + i]
-                            for j in range(6):
-                                block[i, j] += value * motion[d, 6 * b + j]
+                    _add_norm(scale, share, arms[a], pulled[a], other, arms[b], pulled[b], tangent[place])
 
 
 @njit(cache=True, error_model="numpy", _nrt=False)

@@ -106,11 +106,10 @@ def make_system(body: BeamBody, size: int) -> System:
 
 
 @njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
-def _dot(a, b, signs):
+def dot(a, b, signs):
     """Return the sum of the products of two vectors with signs, all of shape (b, 6)."""
-    first, second, sign = a.reshape(a.size), b.reshape(b.size), signs.reshape(signs.size)
-    value = 0.0
-    for i in range(first.shape[0]):
+    first, second, sign, value = a.flat, b.flat, signs.flat, 0.0
+    for i in range(a.size):
         value += sign[i] * first[i] * second[i]
     return value
 
@@ -130,7 +129,7 @@ def factorise_tangent(system, rows):
         copy_values(equations.H[rows[i]], half)
         solve_lower(equations.tangent, body.pattern.pointers, body.pattern.columns, half)
         for j in range(i + 1):
-            value = _dot(half, factor.half[rows[j]], factor.signs)
+            value = dot(half, factor.half[rows[j]], factor.signs)
             factor.compliance[rows[i], rows[j]] = value
             factor.compliance[rows[j], rows[i]] = value
     _factorise_slides(equations.slides, body.pattern, equations.tangent, factor, rows)
@@ -150,7 +149,7 @@ def _factorise_slides(slides, pattern, tangent, factor, rows):
         core = np.eye(count)
         for s in range(count):
             for t in range(count):
-                core[s, t] += _dot(slides.loading[s], slides.direction[t], signs)
+                core[s, t] += dot(slides.loading[s], slides.direction[t], signs)
         slides.core[:count, :count] = np.linalg.inv(core)
     for i in range(rows.shape[0]):
         drive = factor.drive[rows[i]]
@@ -159,7 +158,7 @@ def _factorise_slides(slides, pattern, tangent, factor, rows):
     if count > 0:
         for i in range(rows.shape[0]):
             for j in range(rows.shape[0]):
-                factor.compliance[rows[i], rows[j]] = _dot(factor.half[rows[i]], factor.drive[rows[j]], signs)
+                factor.compliance[rows[i], rows[j]] = dot(factor.half[rows[i]], factor.drive[rows[j]], signs)
 
 
 @njit(cache=True, error_model="numpy")
@@ -199,7 +198,7 @@ def _correct(system, effort, target, drive, is_one_way, among, a, total, index):
     gap = factor.gap
     for i in range(count):
         row = driven[i]
-        gap[i] = equations.delta[row] - target[row] - _dot(factor.half[row], step, factor.signs)
+        gap[i] = equations.delta[row] - target[row] - dot(factor.half[row], step, factor.signs)
         for j in range(forced.shape[0]):
             gap[i] += W[row, forced[j]] * change[forced[j]]
     if is_one_way:
@@ -218,17 +217,17 @@ def _correct(system, effort, target, drive, is_one_way, among, a, total, index):
                 value -= factor.driven[i, j] * gap[j]
             change[driven[i]] = value
     size = step.size
-    flat, signs, scale = step.reshape(size), factor.signs.reshape(size), body.components.scale.reshape(size)
-    for i in range(flat.shape[0]):
-        flat[i] *= -signs[i]
+    flat, signs, scale = step.flat, factor.signs.flat, body.components.scale.flat
+    for i in range(size):
+        flat[i] = -signs[i] * flat[i]
     for c in range(change.shape[0]):
         if change[c] != 0.0:
-            along = factor.drive[c].reshape(size)
-            for i in range(flat.shape[0]):
-                flat[i] += change[c] * signs[i] * along[i]
+            value, along = change[c], factor.drive[c].flat
+            for i in range(size):
+                flat[i] = flat[i] + value * signs[i] * along[i]
     solve_upper(equations.tangent, body.pattern.pointers, body.pattern.columns, step)
     largest = 0.0
-    for i in range(flat.shape[0]):
+    for i in range(size):
         largest = max(largest, abs(flat[i]) * scale[i])
         if flat[i] != flat[i]:  # NaN
             return np.nan

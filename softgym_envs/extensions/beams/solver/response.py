@@ -15,11 +15,12 @@ import numpy as np
 
 from softgym_envs.extensions.beams.solver.block_cholesky import SIZE, copy_values, solve_lower, solve_upper
 from softgym_envs.extensions.beams.solver.block_elimination import eliminate_blocks, solve_blocks
-from softgym_envs.extensions.beams.solver.contact import FEW, add_block, add_wrench, fill_arms
+from softgym_envs.extensions.beams.solver.contact import add_block, add_wrench, fill_arms
+from softgym_envs.extensions.beams.solver.newton import dot
 from softgym_envs.mechanics.compilation import FAST, njit
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST, forceinline=False)
 def _gather(contact, local, motion, out):
     """Fill ``out`` (3 k,) with the motion of the chosen points by that of the frames (b, 6)."""
     for i in range(local.number[0]):
@@ -56,51 +57,42 @@ def _scatter(contact, local, force, free, out):
 @njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
 def _product(a, b):
     """Return the sum of the products of two vectors (b, 6)."""
-    first, second, value = a.reshape(a.size), b.reshape(b.size), 0.0
-    for i in range(first.shape[0]):
+    first, second, value = a.flat, b.flat, 0.0
+    for i in range(a.size):
         value += first[i] * second[i]
     return value
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
-def _signed_product(a, b, signs):
-    """Return the sum of the products of two vectors with signs, all of shape (b, 6)."""
-    first, second, sign, value = a.reshape(a.size), b.reshape(b.size), signs.reshape(signs.size), 0.0
-    for i in range(first.shape[0]):
-        value += sign[i] * first[i] * second[i]
-    return value
-
-
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST, forceinline=False)
 def frames_moved(system, drive, force, motion):
     """Fill ``motion`` (b, 6) with that of the frames by forces (3 k,), and ``local.pull`` (size,) with the efforts."""
     body, equations, factor = system
     local, driven, size = equations.slides.local, drive.driven, motion.size
-    flat, signs = motion.reshape(size), factor.signs.reshape(size)
+    flat, signs = motion.flat, factor.signs.flat
     _scatter(body.contact, local, force, body.components.free, motion)
     solve_lower(equations.tangent, body.pattern.pointers, body.pattern.columns, motion)
     for j in range(driven.shape[0]):
-        local.row[j] = 0.0 if local.slack[j] else _signed_product(factor.half[driven[j]], motion, factor.signs)
+        local.row[j] = 0.0 if local.slack[j] else dot(factor.half[driven[j]], motion, factor.signs)
     for j in range(driven.shape[0]):
         value = 0.0
         for m in range(driven.shape[0]):
             value -= local.among[j, m] * local.row[m]
         local.change[j] = value
     for j in range(driven.shape[0]):
-        value, half = local.change[j], factor.half[driven[j]].reshape(size)
+        value, half = local.change[j], factor.half[driven[j]].flat
         for c in range(size):
-            flat[c] += value * half[c]
+            flat[c] = flat[c] + value * half[c]
     for c in range(size):
-        flat[c] *= signs[c]
+        flat[c] = flat[c] * signs[c]
     solve_upper(equations.tangent, body.pattern.pointers, body.pattern.columns, motion)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST, forceinline=True)
 def points_moved(system, drive, force, out):
     """Fill ``out`` (3 k,) with the motion of the chosen points by forces (3 k,) on them."""
     local = system.equations.slides.local
     size = 3 * local.number[0]
-    if local.number[0] > FEW:
+    if 3 * local.number[0] > local.compliance.shape[0]:
         frames_moved(system, drive, force, local.wrench)
         _gather(system.body.contact, local, local.wrench, out)
         return
@@ -156,7 +148,7 @@ def soften(system, x, effort, drive):
     else:
         local.slack[:] = False
         local.among[:] = factor.driven
-    if local.number[0] <= FEW:
+    if 3 * local.number[0] <= local.compliance.shape[0]:
         _fill_compliance(system, x, drive)
 
 
@@ -203,7 +195,7 @@ def _fill_compliance(system, x, drive):
                     local.compliance[i, n] -= value * local.relief[j, n]
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST, forceinline=False)
 def _eliminate(matrix, right, n):
     """Solve a dense system of n equations in place: ``right`` becomes the solution; whether there is one."""
     for k in range(n):
@@ -231,11 +223,11 @@ def _eliminate(matrix, right, n):
     return True
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST, forceinline=True)
 def newton_step(system, drive, residual, out):
     """Fill ``out`` (3 k,) with ``(1 + K G)^-1 residual``, where ``K`` is ``local.tangent``; whether there is one."""
     local = system.equations.slides.local
-    if local.number[0] > FEW:
+    if 3 * local.number[0] > local.compliance.shape[0]:
         return _step_of_many(system, drive, residual, out)
     number, active, matrix, right = 0, local.active, local.matrix, local.right
     for i in range(local.number[0]):
@@ -294,7 +286,7 @@ def _add_stiffness(contact, local, free):
                         target[r, c] += free[other, r] * free[one, c] * block[r, c]
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST)
+@njit(cache=True, error_model="numpy", _nrt=False, fastmath=FAST, forceinline=False)
 def _step_of_many(system, drive, residual, out):
     """Do what `newton_step` says by the equations of the frames."""
     body, equations, _ = system

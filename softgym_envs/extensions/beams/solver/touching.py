@@ -58,19 +58,25 @@ EXACT = 0.1
 
 @njit(cache=True, error_model="numpy", _nrt=False)
 def _pulls(system, drive, anchors, held):
-    """Fill pulls and tangents of contact at the points moved by the present forces; the energy, or inf inside.
+    """Fill what the present forces move, and what `_pulls_at` does there, which it returns."""
+    local = system.equations.slides.local
+    for i in range(3 * local.number[0]):
+        local.spare[i] = local.force[i] - local.start[i]
+    points_moved(system, drive, local.spare, local.moved)
+    return _pulls_at(system.body.contact, system.equations.slides.touch, local, anchors, held)
+
+
+@njit(cache=True, error_model="numpy", _nrt=False, forceinline=False)
+def _pulls_at(contact, touch, local, anchors, held):
+    """Fill pulls and tangents of contact at the points where ``local.moved`` leads; the energy, or inf inside.
 
     Limits of friction are ``local.limit`` if ``held``; otherwise they follow the normal forces, and are stored there.
     """
-    contact, touch, local = system.body.contact, system.equations.slides.touch, system.equations.slides.local
     count, p, smooth, distance, energy = local.number[0], local.p, local.smooth, contact.law[0], 0.0
-    for i in range(3 * count):
-        local.spare[i] = local.force[i] - local.start[i]
-    points_moved(system, drive, local.spare, local.motion)
     for i in range(count):
         k = local.points[i]
         for d in range(3):
-            p[d] = local.place[i, d] + local.free[3 * i + d] + local.motion[3 * i + d]
+            p[d] = local.place[i, d] + local.free[3 * i + d] + local.moved[3 * i + d]
             local.pull[3 * i + d] = 0.0
             for e in range(3):
                 local.tangent[i, d, e] = 0.0
@@ -111,7 +117,7 @@ def _add(touch, pull, tangent, sliding):
                 tangent[d, e] += touch.direction[d] * touch.loading[e]
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)
 def _open(system, drive):
     """Fill the residual of the forces and what it would move; return the largest of these motions, and their work."""
     local, largest, work = system.equations.slides.local, 0.0, 0.0
@@ -124,7 +130,7 @@ def _open(system, drive):
     return largest, abs(work)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@njit(cache=True, error_model="numpy", _nrt=False, forceinline=True)
 def _spring(system, drive):
     """Return the energy that the forces store in the linearised body [J]."""
     local, energy = system.equations.slides.local, 0.0
@@ -141,12 +147,12 @@ def _descend(system, drive, anchors, exact, held, energy):
     The pulls of the present forces are known, and ``energy`` is theirs. Steps are shortened until they reduce the
     energy if limits are ``held``, and otherwise the work of the residual.
     """
-    local = system.equations.slides.local
-    size, step, kept = 3 * local.number[0], local.step, local.kept
+    contact, touch, local = system.body.contact, system.equations.slides.touch, system.equations.slides.local
+    size, step, kept, before, reach = 3 * local.number[0], local.step, local.kept, local.before, local.reach
     if energy == np.inf:
         return False
+    largest, work = _open(system, drive)
     for _ in range(MAX_LOCAL):
-        largest, work = _open(system, drive)
         if largest <= exact:
             return True
         if held:
@@ -155,25 +161,28 @@ def _descend(system, drive, anchors, exact, held, energy):
             return False
         slope = 0.0
         for i in range(size):
-            kept[i] = local.force[i]
+            kept[i], before[i] = local.force[i], local.moved[i]
             slope -= local.motion[i] * step[i]
             if not abs(step[i]) < np.inf:
                 return False
+        points_moved(system, drive, step, reach)
         part = 1.0
         while True:
             for i in range(size):
                 local.force[i] = kept[i] - part * step[i]
-            new = _pulls(system, drive, anchors, held)
+                local.moved[i] = before[i] - part * reach[i]
+            new = _pulls_at(contact, touch, local, anchors, held)
             if new < np.inf:
+                far, left = _open(system, drive)
                 if held:
                     if new + _spring(system, drive) <= energy + 1e-4 * part * slope + 1e-14 * abs(energy):
                         break
-                elif largest < 10.0 * exact or np.sqrt(_open(system, drive)[1]) <= (1.0 - 0.1 * part) * np.sqrt(work):
+                elif largest < 10.0 * exact or np.sqrt(left) <= (1.0 - 0.1 * part) * np.sqrt(work):
                     break
             part *= 0.5
             if part < 1e-5:
                 return False
-        energy = new
+        energy, largest, work = new, far, left
     return False
 
 
@@ -183,7 +192,7 @@ def _hold_points(system, drive):
     local = system.equations.slides.local
     count, square, product = local.number[0], 0.0, 0.0
     for i in range(3 * count):
-        local.residual[i] = local.free[i] + local.motion[i]
+        local.residual[i] = local.free[i] + local.moved[i]
     points_moved(system, drive, local.residual, local.motion)
     for i in range(3 * count):
         square += local.residual[i] * local.residual[i]
@@ -203,12 +212,14 @@ def _hold_points(system, drive):
 
 @njit(cache=True, error_model="numpy")
 def _find_forces(system, drive, anchors, exact):
-    """Solve for the forces of contact on the linearised body; 1 if they are found, 0 if nearly, -1 if not."""
+    """Solve for the forces of contact on the linearised body, near those given; 1 if found, 0 if nearly, -1 if not."""
     local = system.equations.slides.local
     size, count, force = 3 * local.number[0], local.number[0], local.force
     held, follow = exact > 0.0, not exact > 0.0  # no literals, for each of which everything would be compiled again
-    force[:size] = local.start[:size]
     energy = _pulls(system, drive, anchors, follow)
+    if energy == np.inf:
+        force[:size] = local.start[:size]
+        energy = _pulls(system, drive, anchors, follow)
     for _ in range(MAX_HELD):
         if energy < np.inf:
             break
@@ -248,20 +259,28 @@ def _find_forces(system, drive, anchors, exact):
 
 
 @njit(cache=True, error_model="numpy")
-def _press(system, x, step, drive, exact):
-    """Add to a step of the body what the forces of contact change on it; what `_find_forces` returns."""
+def _press(system, x, step, drive, exact, first):
+    """Add to a step of the body what the forces of contact change on it; what `_find_forces` returns.
+
+    They are looked for near those at the start of the time step if this is its ``first`` step, otherwise near those at
+    rows ``x``.
+    """
     body, equations, factor = system
     contact, local = body.contact, equations.slides.local
     size = 3 * local.number[0]
-    for i in range(local.number[0]):
-        point_at(contact, local.group[i], local.points[i], x, local.place[i])
     local.free[:size] = 0.0
-    local.force[:size] = 0.0
-    local.start[:size] = 0.0
-    if _pulls(system, drive, step.anchors, not exact > 0.0) == np.inf:
-        return -1
-    for i in range(size):
-        local.start[i] = -local.pull[i]
+    local.moved[:size] = 0.0
+    for rows in (step.x, x):
+        if rows is x or first:
+            for i in range(local.number[0]):
+                point_at(contact, local.group[i], local.points[i], rows, local.place[i])
+            if _pulls_at(contact, equations.slides.touch, local, step.anchors, not exact > 0.0) == np.inf:
+                return -1
+            local.force[:size] = local.start[:size]
+            for i in range(size):
+                local.start[i] = -local.pull[i]
+    if not first:
+        local.force[:size] = local.start[:size]
     points_follow(system, x, factor.step, local.free)
     found = _find_forces(system, drive, step.anchors, exact)
     if found < 0:
@@ -278,14 +297,13 @@ def _press(system, x, step, drive, exact):
 
 
 @njit(cache=True, error_model="numpy", _nrt=False)
-def _take(system, kept, x, stride, part):
+def _take(frames, factor, kept, x, stride, part):
     """Move rows ``x`` by a part of a step from those ``kept``."""
-    factor = system.factor
     copy_values(kept, x)
     for k in range(stride.shape[0]):
         for i in range(SIZE):
             factor.step[k, i] = part * stride[k, i]
-    move(system.body.frames, x, factor.step, factor.turned)
+    move(frames, x, factor.step, factor.turned)
 
 
 @njit(cache=True, error_model="numpy", _nrt=False)
@@ -358,7 +376,7 @@ def solve_touching(system, x, effort, target, drive, step, tolerance, fresh):
             return -1
         # Without the stiffness of contact, a body may be nearly unstable and its step far too long.
         stride[:] = factor.step
-        _take(system, x, moved, stride, min(1.0, LONGEST * radian / max(length, 1e-300)))
+        _take(body.frames, factor, x, moved, stride, min(1.0, LONGEST * radian / max(length, 1e-300)))
         factor.step[:] = stride
         others = _choose(contact, slides, x, moved, renewed)
         renewed = False
@@ -367,7 +385,7 @@ def solve_touching(system, x, effort, target, drive, step, tolerance, fresh):
             if others or one_way:
                 soften(system, x, effort, drive)
             # Far from the solution, the linearised body may have no consistent state: what is nearly one leads on.
-            found = _press(system, x, step, drive, max(EXACT * enough, 1e-13))
+            found = _press(system, x, step, drive, max(EXACT * enough, 1e-13), iteration == 1)
             if found < 0:
                 return -1
             length = 0.0
@@ -386,7 +404,7 @@ def solve_touching(system, x, effort, target, drive, step, tolerance, fresh):
         kept[:] = x
         part, free = min(1.0, LONGEST * radian / max(length, 1e-300)), 0.0
         while free < 1.0:
-            _take(system, kept, x, stride, part)
+            _take(body.frames, factor, kept, x, stride, part)
             free = free_part(contact, slides, kept, x)
             part *= free  # the way bends, so it is tested again
             if part < SHORTEST:
