@@ -104,7 +104,6 @@ test: setup test-programs
 test-clients: setup
 	$(BIN)/python examples/clients/run.py $(ARGS)
 
-# Run this on an idle machine.
 slow-tests: setup test-programs
 	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal --update-slow-tests
 

@@ -37,8 +37,14 @@ DATA = Path(__file__).parent / "data"
 # -- slow tests ---------------------------------------------------------------------------------------------------
 
 SLOW_TESTS = Path(__file__).parent / "slow_tests.txt"
-SLOW = 0.3
-"""A test function whose cases take longer than this together is slow [s]."""
+SLOW = 0.2
+"""A test function whose cases take longer than this together is slow [CPU s, processes that it waits for included]."""
+CPU_TIME = pytest.StashKey[float]()
+
+
+def cpu_time():
+    """Return the CPU time of this process and of those it has waited for [s], which hardly depends on other work."""
+    return sum(os.times()[:4])
 
 
 def pytest_addoption(parser):
@@ -63,15 +69,23 @@ class SlowTestsWriter:
 
     def pytest_runtest_logreport(self, report):
         path, _, function = report.nodeid.partition("[")[0].partition("::")
-        if report.when == "setup" and report.duration > SLOW:
+        if report.when == "setup" and report.cpu_time > SLOW:
             function = ""  # a slow fixture, which any test of the file may be the first to need
-        self.seconds[f"{path}::{function}" if function else path] += report.duration
+        self.seconds[f"{path}::{function}" if function else path] += report.cpu_time
 
     def pytest_sessionfinish(self):
         slow = {test for test, seconds in self.seconds.items() if seconds > SLOW}
         lines = sorted(test for test in slow if test.partition("::")[0] not in slow or "::" not in test)
-        head = f"# Files and functions marked as slow: they took longer than {SLOW} s. Written by `make slow-tests`."
+        head = f"# Slow files and test functions: they took longer than {SLOW} CPU s. Written by `make slow-tests`."
         SLOW_TESTS.write_text("\n".join([head, *lines]) + "\n")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item):
+    report = yield
+    report.cpu_time = cpu_time() - item.stash[CPU_TIME]
+    item.stash[CPU_TIME] += report.cpu_time
+    return report
 
 
 def pytest_ignore_collect(collection_path, config):
@@ -93,6 +107,7 @@ def pytest_collection_modifyitems(items):
 
 @pytest.hookimpl(wrapper=True, trylast=True)
 def pytest_runtest_protocol(item):
+    item.stash[CPU_TIME] = cpu_time()
     if item.config.option.usepdb:
         return (yield)
     with end_if_hung(item.config.stash[fault_handler_stderr_fd_key]):
