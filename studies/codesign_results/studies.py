@@ -1,9 +1,9 @@
 """Record what studies found: baseline and winner of each on the test goals, by finite elements.
 
     softgym codesign --config NAME --folder F
-    python -m benchmarks.studies F [F ...]
+    python studies/codesign_results/studies.py F [F ...]
 
-copies the comparison of each finished study into ``benchmarks/data/recorded.json``, with its commit and command.
+copies the comparison of each finished study into ``results.json`` beside this file, with its commit and command.
 """
 
 from __future__ import annotations
@@ -14,15 +14,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.recorded import SOURCES
-from softgym_envs.agents.results import LEARNERS
+from softgym_envs.agents.learners import LEARNERS
 from softgym_envs.codesign.config import StudyConfig
 from softgym_envs.config import load_config
 from softgym_envs.errors import DataError
 from softgym_envs.storage import write_json
 from softgym_envs.wording import decimal
 
-RECORDED = SOURCES[0]
+RECORDED = Path(__file__).with_name("results.json")
 
 TITLES = {
     "finger_reach": "Soft Finger",
@@ -133,7 +132,7 @@ def _controller(config: StudyConfig, found: dict[str, Any], agent: str) -> str:
         return "inverse QP"
     seeds = len({training["seed"] for training in found["trainings"]})
     trainings = f", {seeds} trainings" if seeds > 1 else ""
-    return f"{LEARNERS[config.training.learner]}, a policy for each body{trainings}"
+    return f"{LEARNERS[config.training.learner].title}, a policy for each body{trainings}"
 
 
 def _interval(compared: dict[str, Any], name: str) -> list[float] | None:
