@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from softgym_envs.extensions import beams
 from softgym_envs.extensions.beams.beam import Beam, Section
 from softgym_envs.extensions.beams.chamber import Chamber
 from softgym_envs.extensions.beams.pose import Pose
@@ -27,7 +28,11 @@ from softgym_envs.mechanics.constraints.point import Point
 from softgym_envs.mechanics.elements.quadratic import add_midside_nodes, quadratic_triangles, split_triangles
 from softgym_envs.mechanics.frames import frame_rows
 
-MODULES = [import_module(f"{constraints.__name__}.{info.name}") for info in iter_modules(constraints.__path__)]
+MODULES = [
+    import_module(f"{package.__name__}.{info.name}")
+    for package in (constraints, beams)
+    for info in iter_modules(package.__path__)
+]
 CLASSES = {
     name: cls
     for module in MODULES
