@@ -174,7 +174,7 @@ def test_errors_of_a_callers_code_keep_their_traceback():
         scale(np.ones(3), "x")
     with pytest.raises(ValueError, match=r"^operands could not be broadcast"):
         scale([1, 2])
-    with pytest.raises(ValueError, match=r"tendon cannot take name = 't', places = \[\[0.1\]\], offsets = .*broadcast"):
+    with pytest.raises(ValueError, match=r"tendon cannot take .* places = \[\[0.1\]\], offsets = .*broadcast"):
         tendon("t", [[0.1]], np.zeros((3, 3)))
     with pytest.raises(TypeError, match="unexpected keyword argument 'nme'"):
         scale([1.0], nme="x")
