@@ -358,7 +358,8 @@ class Backend(ABC):
         """Return the state under a command without going there."""
         kept = self.state
         try:
-            return self.step(command, mode)
+            # The default of a backend that knows one quantity alone is that quantity.
+            return self.step(command) if mode == COMMANDED else self.step(command, mode)
         finally:
             self.restore(kept)
 
