@@ -10,7 +10,8 @@ import pytest
 from softgym_envs import make_robot
 from softgym_envs.backends.fem import FEMBackend
 from softgym_envs.extensions.walkers.fluid import slender_drag
-from softgym_envs.extensions.walkers.robots.swimmer import CHAMBER_OFFSET, CHAMBER_RADIUS, PERIOD, SEGMENTS
+from softgym_envs.extensions.walkers.robots.swimmer import PERIOD, SEGMENTS
+from softgym_envs.extensions.walkers.robots.tapered import CHAMBER_OFFSET, CHAMBER_RADIUS
 from tests.verification.swimmers import swim
 
 
