@@ -37,7 +37,7 @@ DATA = Path(__file__).parent / "data"
 # -- slow tests ---------------------------------------------------------------------------------------------------
 
 SLOW_TESTS = Path(__file__).parent / "slow_tests.txt"
-SLOW = 0.2
+SLOW = 0.1
 """A test function whose cases take longer than this together is slow [CPU s, processes that it waits for included]."""
 CPU_TIME = pytest.StashKey[float]()
 
