@@ -176,6 +176,26 @@ def test_bodies_move_beside_what_stands_in_their_way():
     np.testing.assert_allclose(figure.data[2].z, -200.0)
 
 
+def test_contact_forces_are_lines_that_end_where_the_body_touches():
+    wall = Plane((0.0, 0.035, 0.0), (0.0, -1.0, 0.0))
+    env = gymnasium.make("SoftGym/Reach-v0", robot="finger", backend="fem", robot_options={"obstacles": [wall]})
+    env.reset(seed=0)
+    inner = env.unwrapped
+    states = [inner.state, inner.backend.step(np.array([0.008, 0.0]))]
+    shown = {"robot": inner.robot, "design": dict(inner.design), "model": inner.backend.model, "task": inner.task}
+    goals = {"goals": [inner.goal] * 2, "distances": [0.0] * 2, "rewards": [None] * 2, "path": inner.path}
+    figure = motion([Episode("winner", **shown, states=states, **goals)], None)
+    (forces,) = [trace for trace in figure.data if trace.name.startswith("contact forces on the winner, 1 N is ")]
+    starts, ends = (np.array([forces[axis][k::3] for axis in "xyz"], dtype=float).T for k in range(2))
+    contacts = states[1].contacts
+    np.testing.assert_allclose(ends, 1e3 * contacts.point)
+    drawn = 1e-3 * (ends - starts)
+    np.testing.assert_allclose(np.linalg.norm(drawn, axis=1).max(), 0.2 * inner.robot.size)
+    np.testing.assert_allclose(drawn / drawn[0, 1], contacts.force / contacts.force[0, 1], atol=1e-9)
+    first, last = figure.frames[0].data[2], figure.frames[-1].data[2]
+    assert len(first.x) == 0 and len(last.x) == 3 * contacts.count
+
+
 def test_plots_show_every_complete_trial(tested):
     snapshot = tested(FAR, FAR)
     results = collect(snapshot)

@@ -20,7 +20,10 @@ MAX_FRAMES = 24
 MAX_POINTS = 60_000
 """Largest number of surface points in all frames of a body, which bounds the size of the page."""
 
-OBSTACLE = "#9db4d4"
+OBSTACLE, FORCE = "#9db4d4", "#111827"
+
+LONGEST_FORCE = 0.2
+"""Length of the largest contact force that is drawn, relative to the size of the robot."""
 
 GOAL_KINDS: tuple[tuple[str, str, str, str], ...] = (
     ("reached by both", "circle", "#1d4ed8", "●"),
@@ -145,6 +148,7 @@ def motion(episodes: Sequence[Episode], outcomes: GoalOutcomes | None) -> Figure
     count = max(2, min(MAX_FRAMES, max(len(e.states) for e in episodes), MAX_POINTS // points))
     picks = [episode.pick(count) for episode in episodes]
     figure = blank(560, scene=_scene(), uirevision="constant")
+    stretch = _force_stretch(episodes, picks)
 
     def traces(frame: int, whole: bool) -> list[dict[str, Any]]:
         drawn: list[dict[str, Any]] = []
@@ -154,6 +158,8 @@ def motion(episodes: Sequence[Episode], outcomes: GoalOutcomes | None) -> Figure
             assert nodes is not None, "finite elements compute nodes"
             drawn.append(_body_trace(episode.role, surface.points(nodes), surface.triangles if whole else None))
             drawn.append(_tip_trace(episode, index, whole))
+            if stretch is not None:
+                drawn.append(_force_trace(episode, index, stretch, whole))
         return drawn
 
     length = max(map(len, picks))
@@ -247,6 +253,32 @@ def _tip_trace(episode: Episode, index: int, whole: bool) -> dict[str, Any]:
             "marker": {"color": colour, "size": 2.5},
         }
         trace |= {"name": f"path of the {episode.role}'s effector", "showlegend": False, "hoverinfo": "name", **look}
+    return trace
+
+
+def _force_stretch(episodes: Sequence[Episode], picks: Sequence[list[int]]) -> float | None:
+    """Return the length in which a contact force of 1 N is drawn [m]; None if no body touches anything."""
+    largest = 0.0
+    for episode, pick in zip(episodes, picks, strict=True):
+        for index in pick:
+            contacts = episode.states[index].contacts
+            if contacts is not None and contacts.count:
+                largest = max(largest, float(np.linalg.norm(contacts.force, axis=1).max()))
+    return LONGEST_FORCE * episodes[0].robot.size / largest if largest > 0.0 else None
+
+
+def _force_trace(episode: Episode, index: int, stretch: float, whole: bool) -> dict[str, Any]:
+    """Return the forces of obstacles on a body as lines that end where it touches, ``stretch`` metres per newton."""
+    contacts = episode.states[index].contacts
+    if contacts is None:
+        lines = np.zeros((0, 2, 3))
+    else:
+        lines = 1e3 * np.stack([contacts.point - stretch * contacts.force, contacts.point], axis=1)
+    x, y, z = (_broken(lines[:, :, axis]) for axis in range(3))
+    trace: dict[str, Any] = {"type": "scatter3d", "x": x, "y": y, "z": z}
+    if whole:
+        name = f"contact forces on the {episode.role}, 1 N is {1e3 * stretch:.2g} mm long"
+        trace |= {"mode": "lines", "line": {"color": FORCE, "width": 5}, "name": name, "hoverinfo": "name"}
     return trace
 
 
