@@ -193,7 +193,7 @@ def test_contact_forces_are_lines_that_end_where_the_body_touches():
     np.testing.assert_allclose(np.linalg.norm(drawn, axis=1).max(), 0.2 * inner.robot.size)
     np.testing.assert_allclose(drawn / drawn[0, 1], contacts.force / contacts.force[0, 1], atol=1e-9)
     first, last = figure.frames[0].data[2], figure.frames[-1].data[2]
-    assert len(first.x) == 0 and len(last.x) == 3 * contacts.count
+    assert first.x == (None,) and len(last.x) == 3 * contacts.count
 
 
 def test_plots_show_every_complete_trial(tested):

@@ -274,7 +274,8 @@ def _force_trace(episode: Episode, index: int, stretch: float, whole: bool) -> d
         lines = np.zeros((0, 2, 3))
     else:
         lines = 1e3 * np.stack([contacts.point - stretch * contacts.force, contacts.point], axis=1)
-    x, y, z = (_broken(lines[:, :, axis]) for axis in range(3))
+    # A trace without points would leave the legend for good.
+    x, y, z = (_broken(lines[:, :, axis]) or [None] for axis in range(3))
     trace: dict[str, Any] = {"type": "scatter3d", "x": x, "y": y, "z": z}
     if whole:
         name = f"contact forces on the {episode.role}, 1 N is {1e3 * stretch:.2g} mm long"
