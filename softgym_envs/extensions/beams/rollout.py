@@ -92,7 +92,8 @@ class Rollout:
             by_velocity: by the velocities of the rows, likewise.
             by_effort: by the efforts, shape (k, size) or (size,).
             neighbours: of the body, for derivatives by its design. A motion that began with `Statics.reset` begins with
-                the shape at rest of any body; one that began elsewhere, with the frames where they were.
+                the shape at rest of any body; one that began elsewhere, with the frames where they were: how gravity
+                bends other bodies before they move is left out, which is 6 % for a whip that hangs.
 
         Raises:
             ConvergenceError: if a tangent is singular.
