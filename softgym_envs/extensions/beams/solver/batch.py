@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import config, types
+from numba import types
 from numba.extending import overload
 
 from softgym_envs.extensions.beams.solver.block_cholesky import SIZE, BlockPattern
@@ -88,7 +88,7 @@ class BeamStates(NamedTuple):
 
 def thread_count() -> int:
     """Return ``NUMBA_NUM_THREADS`` where that is set, otherwise 1: cores belong to processes unless a user says so."""
-    return int(config.NUMBA_NUM_THREADS) if "NUMBA_NUM_THREADS" in os.environ else 1
+    return int(os.environ.get("NUMBA_NUM_THREADS", 1))
 
 
 class BeamBatch:
