@@ -358,7 +358,7 @@ class Backend(ABC):
         """Return the state under a command without going there."""
         kept = self.state
         try:
-            # The default of a backend that knows one quantity alone is that quantity.
+            # A backend that takes one quantity alone has that as its default.
             return self.step(command) if mode == COMMANDED else self.step(command, mode)
         finally:
             self.restore(kept)

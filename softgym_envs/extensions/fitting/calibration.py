@@ -22,7 +22,7 @@ import copy
 import itertools
 import json
 from collections.abc import Callable
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +37,7 @@ from softgym_envs.extensions.fitting.data.strata import (
     solve_commands,
     strata_of,
 )
-from softgym_envs.extensions.fitting.predictions import Predictions, StratumReport, by_stratum, predict, reached, report
+from softgym_envs.extensions.fitting.predictions import Predictions, StratumReport, predict, reached, report
 from softgym_envs.robots.base import Robot
 from softgym_envs.storage import write_json
 from softgym_envs.surrogate.domain import Calibration
@@ -356,30 +356,6 @@ def tested(
     if adversarial_states:
         parts.append(adversarial_search(model, adversarial_states, states, seed, state_folder, workers=workers))
     return report(model, StratifiedStates.join(parts))
-
-
-def cross_validated(model: SurrogateModel, states: StratifiedStates, folds: int = 16) -> dict[str, StratumReport]:
-    """Return how a model does where its calibration has not seen the body, for states too expensive to solve others.
-
-    Bodies are divided into parts. Factors and limit of trust for the states of each part are those of all other parts.
-
-    Args:
-        model: its own calibration is not used.
-        states: those of the calibration, with or without those of an adversarial search.
-        folds: number of parts.
-    """
-    tolerance, parts, order = model.robot.goal_tolerance, [], []
-    for fold in range(folds):
-        left_out = states.body % folds == fold
-        known = states.rows(~left_out)
-        calibration = fit_calibration(model, known)
-        limit = safe_limit(predict(_calibrated(model, calibration), known), tolerance)
-        parts.append(predict(_calibrated(model, calibration, limit), states.rows(left_out)))
-        order.append(np.flatnonzero(left_out))
-    back = np.argsort(np.concatenate(order))
-    columns = [[getattr(part, f.name) for part in parts] for f in fields(Predictions)]
-    every = Predictions(*(np.concatenate(column)[back] for column in columns if column[0] is not None))
-    return by_stratum(every, states)
 
 
 def calibration_states(model: SurrogateModel, folder: str | Path) -> StratifiedStates:

@@ -266,18 +266,3 @@ def _tracks(runs: Sequence[Stored]) -> Iterator[tuple[tuple[str, str, bool, int]
         track = load_problem(contest.problem, check=False).definition.track
         groups[track, contest.judge, contest.listed, seeds].append(contest)
     yield from sorted(groups.items())
-
-
-def improvements(
-    runs: Sequence[Stored], judge: str, first: str, second: str, *, listed: bool = False
-) -> Estimate | None:
-    """Return the probability that a run of one method ends with less regret than one of another.
-
-    It is over the problems on which both ran, on tables if ``listed``; None if there are none.
-    """
-    found = [c for c in contests(runs) if c.judge == judge and c.listed == listed and {first, second} <= set(c.runs)]
-    if not found:
-        return None
-    count = min(len(contest.runs[method]) for contest in found for method in (first, second))
-    a, b = (-np.stack([np.round(c.regrets(m)[:count] / EQUAL) for c in found], axis=1) for m in (first, second))
-    return improvement(a, b)

@@ -277,25 +277,6 @@ def test_every_stratum_is_covered_on_new_states(robot, bodies, off):
     assert found.inside < found.corners < found.slack_corners
 
 
-def test_bodies_that_are_left_out_are_judged_by_the_others(trunk):
-    kinds = strata_of(trunk.robot, buckles=False)
-    states = StratifiedStates.join(
-        [
-            predicted_states(trunk, kind, 10, 2, seed=k, noise=lambda spread, rng: spread * rng.uniform(0.9, 1.0))
-            for k, kind in enumerate(kinds)
-        ]
-    )
-    # With 20 states, the largest error of a stratum is the bound. One body is off by far more than all others.
-    odd = np.flatnonzero(states.body == 7)
-    states.effector[odd, :3] += 50.0 * predict(trunk, states).spread.max()
-    calibrated = module._calibrated(trunk, fit_calibration(trunk, states))
-    assert report(calibrated, states)["inside"].coverage >= 0.95
-    rows = module.cross_validated(trunk, states, folds=40)
-    assert rows.keys() == set(kinds)
-    assert all(row.states == 20 for row in rows.values())
-    assert rows["inside"].coverage <= 0.9
-
-
 def test_reports_count_the_states_whose_slack_actuators_are_told():
     model = pretrained_model(make_robot("finger"))
     states = predicted_states(model, "slack corners", 4, 5, seed=3)

@@ -86,9 +86,6 @@ def test_regret_area_and_steps_follow_from_the_curves(monkeypatch):
     limit = SPENT["environment_steps"]
     assert a.area == pytest.approx(np.log(10) / np.log(limit / 600))
     assert b.area == pytest.approx((np.log(2) + 0.5 * np.log(limit / 1200)) / np.log(limit / 600))
-    found = regret.improvements([(each, None) for each in (*first, *second)], "qp", "a", "b")
-    assert found.value == 1.0
-    assert regret.improvements([(first[0], None)], "qp", "a", "b") is None
 
 
 def test_runs_resume_and_become_a_table(tiny, tmp_path):
